@@ -1,4 +1,4 @@
-import { describe, expect, it } from "vitest";
+import { describe, expect, it, vi } from "vitest";
 import { type Choice, type ListedSurface, problemOf, Server } from "../src/page/api";
 import { parseConfiguration } from "../src/page/configuration";
 import { choiceName, choiceQuestion, matches, nameOf } from "../src/page/names";
@@ -92,6 +92,16 @@ describe("the server", () => {
     const problem = problemOf(401, '{"title": "A token is needed", "code": "no-token", "detail": "No token came"}');
     expect([problem.status, problem.code, problem.message]).toEqual([401, "no-token", "No token came"]);
     expect(problemOf(502, "<html>").code).toBe("http-502");
+  });
+
+  it.each([
+    ["a head", new Response(null, { headers: { date: "Sun" } })],
+    ["a document", new Response('{"id": "a')],
+    ["a link", new Response(new ReadableStream({ start: (stream) => stream.error(new TypeError("network error")) }))],
+  ])("that breaks off in the middle of %s could not be reached", async (_, answer) => {
+    vi.spyOn(globalThis, "fetch").mockResolvedValue(answer);
+    await expect(new Server("https://host/").look("v1/surfaces/a")).rejects.toMatchObject({ code: "network" });
+    vi.restoreAllMocks();
   });
 
   it("stands below any path, and is the only host", () => {

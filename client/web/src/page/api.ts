@@ -183,14 +183,21 @@ export class Server {
 
   private async json(method: string, path: string): Promise<unknown> {
     const headers: Record<string, string> = this.token === null ? {} : { authorization: `Bearer ${this.token}` };
+    const address = this.address(path);
     let answer: Response;
+    let text: string;
     try {
-      answer = await fetch(this.address(path), { method, headers, credentials: "omit" });
-    } catch (error) {
-      if (error instanceof ProblemError) throw error;
+      answer = await fetch(address, { method, headers, credentials: "omit" });
+      text = await answer.text();
+    } catch {
       throw new ProblemError(0, "network", "The server could not be reached");
     }
-    if (!answer.ok) throw problemOf(answer.status, await answer.text());
-    return answer.status === 204 ? null : answer.json();
+    if (!answer.ok) throw problemOf(answer.status, text);
+    if (answer.status === 204) return null;
+    try {
+      return JSON.parse(text);
+    } catch {
+      throw new ProblemError(0, "network", "The server's answer broke off");
+    }
   }
 }
