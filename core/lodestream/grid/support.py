@@ -105,11 +105,8 @@ def coefficients_needed(samples: Mask, step: AxisStep) -> Mask:
     if step.wraps:
         nodes[places % step.run] = True
     else:
+        # Nodes beyond an end are extrapolated from the three within it, which the same detail reaches.
         nodes[places[(places >= 0) & (places < step.run)]] = True
-        if places.min() < 0:
-            nodes[:3] = True  # the nodes beyond the end are extrapolated from these
-        if places.max() >= step.run:
-            nodes[-3:] = True
     line[: step.run] |= nodes
     line[step.coarse :] = details
     return line

@@ -99,10 +99,8 @@ function markThirdSteps(nodes: Uint8Array, details: Uint8Array, step: AxisStep):
     if (!details[detail]) continue;
     for (let place = detail - 2; place <= detail + 3; place++) {
       if (wraps) nodes[(place + 2 * run) % run] = 1;
+      // Nodes beyond an end are extrapolated from the three within it, which the same detail reaches.
       else if (place >= 0 && place < run) nodes[place] = 1;
-      // From these the nodes beyond the end are extrapolated.
-      else if (place < 0) nodes.fill(1, 0, 3);
-      else nodes.fill(1, Math.max(run - 3, 0));
     }
   }
 }
