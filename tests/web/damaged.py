@@ -1,7 +1,8 @@
 """Damaged containers and what is said of them, as JSON; ``python -m tests.web.damaged SEED COUNT`` prints one a line.
 
-First every golden file with a bit changed here and there, then COUNT containers with other contents in a field, and all
-checksums that enclose it made right. The decoder of `client/web` must say the same, at the same place.
+First every golden file with a bit changed here and there, then COUNT containers with other contents in a field, and
+small ones with each other dtype, all checksums that enclose it made right. The decoder of `client/web` must say the
+same, at the same place.
 """
 
 from __future__ import annotations
@@ -15,14 +16,15 @@ from typing import Any
 
 import lodestream as ls
 from lodestream.errors import LodestreamError
+from tests.core.container.forgery import with_dtypes
 from tests.core.container.mutants import mutant
 from tests.core.container.test_hostile_containers import MOST, containers
 from tests.golden.generate import FOLDER, digests
 
 
 def main(seed: int, count: int) -> None:
-    """Flipped bits, then mutants."""
-    for name, data in (*flipped(seed), *mutants(seed, count)):
+    """Flipped bits, then mutants, then other dtypes."""
+    for name, data in (*flipped(seed), *mutants(seed, count), *retyped()):
         print(json.dumps({"name": name, "container": base64.b64encode(data).decode(), **said(data)}), flush=True)
 
 
@@ -44,6 +46,13 @@ def mutants(seed: int, count: int) -> Iterator[tuple[str, bytes]]:
     for number in range(count):
         name = known[number % len(known)]
         yield f"{name}, mutant {number}", mutant(*containers()[name], chance)
+
+
+def retyped() -> Iterator[tuple[str, bytes]]:
+    """Of the same containers."""
+    for name, (data, _) in sorted(containers().items()):
+        for what, dtype, changed in with_dtypes(data):
+            yield f"{name}, {what or 'points'} as {dtype}", changed
 
 
 def said(data: bytes) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +12,7 @@ from lodestream.container import Index, headers, read_index, sections
 from lodestream.container.digest import DIGEST
 from lodestream.container.fields import told
 from lodestream.container.index import serialize_index
+from lodestream.container.shape import DTYPES
 
 __all__ = [
     "index_of",
@@ -19,6 +20,7 @@ __all__ = [
     "rewritten",
     "sections_of",
     "unchanged",
+    "with_dtypes",
     "with_header",
     "with_index",
     "with_layer_errors",
@@ -123,3 +125,16 @@ def with_header(data: bytes, **changes: Any) -> bytes:
     made = headers.serialize_header(header)
     rest = with_index(data, replace(index, header=replace(index.header, length=len(made))))
     return made + rest[index.header.length :]
+
+
+def with_dtypes(data: bytes) -> Iterator[tuple[str | None, np.dtype[Any], bytes]]:
+    """The container with each other dtype for its points (None), and for each attribute, with what has which dtype."""
+    header = index_of(data).header
+    for dtype in DTYPES:
+        if dtype != header.dtype:
+            yield None, dtype, with_header(data, dtype=dtype)
+        for number, kind in enumerate(header.attributes):
+            if dtype != kind.dtype:
+                attributes = list(header.attributes)
+                attributes[number] = replace(kind, dtype=dtype)
+                yield kind.name, dtype, with_header(data, attributes=tuple(attributes))

@@ -25,12 +25,16 @@ from tests.golden.generate import FOLDER
 
 from ..surfaces import all_large, index_of, terrain
 from ..transfer.test_range_download import File
+from .forgery import with_dtypes
 from .mutants import Anatomy, mutant
 
 MOST = 20_000
 REGION = (0, 5), (1, 4)
 #: With masks, kept holes, attributes, parts and curves, indices, large units, chunks of every rule.
-NAMES = ("holes-closed", "infinite-plane", "cylinder-disc", "error-attributes", "large-sparse", "heights-decimal")
+NAMES = (
+    *("holes-closed", "infinite-plane", "cylinder-disc", "error-attributes", "large-sparse", "heights-decimal"),
+    *("heights-noise", "heights-offsets", "residual-decimals"),
+)
 
 
 @cache
@@ -110,6 +114,25 @@ def test_every_fault_is_told(name: str) -> None:
             assert "expected" in told
             assert not isinstance(error, CorruptStreamError | TruncatedStreamError) or " byte" in told  # noqa: PT017
     assert refused > 60
+
+
+@pytest.mark.parametrize("name", containers())
+def test_values_of_another_dtype_are_refused_or_have_it(name: str) -> None:
+    """Bits of coefficients say nothing of dtypes; chunks of the residual fit some others too."""
+    original, _ = containers()[name]
+    refused = 0  # in our words
+    for what, dtype, data in with_dtypes(original):
+        for transport in TRANSPORTS:
+            try:
+                transport(data)
+            except LodestreamError as error:
+                refused += "expected" in str(error)
+        try:
+            block = ls.decode(data, max_vertices=MOST).blocks[0]
+        except LodestreamError:
+            continue
+        assert (block.points if what is None else block.attributes[what]).dtype == dtype
+    assert refused or not index_of(original).header.corrected
 
 
 def test_nothing_stands_before_the_header() -> None:
