@@ -18,6 +18,7 @@ __all__ = [
     "is_served",
     "is_surface",
     "is_url",
+    "made_url",
     "name_url",
     "names_url",
     "origin",
@@ -303,6 +304,25 @@ def resolved(base: str, address: str) -> str:
         url = ""
     if not _ADDRESS.fullmatch(url) or not origin(url):
         raise RemoteProtocolError(f"expected an address from {base}, got {address!a:.200}")
+    return url
+
+
+def made_url(collection: str, location: str) -> str:
+    """Return the URL of what a server has made in one of its collections, from the Location of its answer.
+
+    Raises
+    ------
+    RemoteProtocolError
+        If that is no address, or one on this host without the path under which the server is reached.
+    """
+    url = resolved(collection, location)
+    server = collection.rpartition("/v1/")[0]
+    path = urlsplit(server).path
+    if same_origin(url, server) and not urlsplit(url).path.startswith(f"{path}/"):
+        raise RemoteProtocolError(
+            f"{server} gives addresses without its path {path}, such as {url}: where a proxy removes the path from "
+            f"requests, the server must be started with LODESTREAM_ROOT_PATH={path}"
+        )
     return url
 
 

@@ -179,7 +179,7 @@ def _sent(url: str, parameters: Mapping[str, str | list[str]], body: Body) -> Fl
         yield Aside(body.hash)
         uploads = addresses.uploads_url(url)
         begun = yield Call("POST", uploads, named, headers=resuming.beginning(body))
-        if begun is not None and begun.status not in resuming.ABSENT:
+        if begun is not None and not resuming.is_absent(begun):
             surface = yield from resuming.completed(uploads, _location(begun, uploads), body)
             return _described(_checked((yield Call("GET", surface)), surface), surface)
     collection = addresses.surfaces_url(url)
@@ -478,7 +478,7 @@ def _location(answer: Answer | None, collection: str) -> str:
     location = response.headers.get("location", "")
     if not location:
         raise RemoteProtocolError(f"expected the new surface's Location from {collection}, got none")
-    return addresses.resolved(collection, location)
+    return addresses.made_url(collection, location)
 
 
 def _own_address(entry: Mapping[str, Any], page: str) -> str:

@@ -24,7 +24,7 @@ from ..errors import SilenceError, UnreachableError
 from . import addresses
 from .answers import parse
 
-__all__ = ["NoStreamError", "blocks_sockets", "from_code", "from_connection", "from_response", "passes"]
+__all__ = ["NoStreamError", "blocks_sockets", "from_code", "from_connection", "from_response", "is_ours", "passes"]
 
 _E = TypeVar("_E", bound=BaseException)
 
@@ -93,6 +93,12 @@ def from_response(status: int, reason: str, body: bytes, url: str) -> Lodestream
     return _BY_STATUS[status](message) if status in _BY_STATUS else RemoteError(f"http-{status}", message)
 
 
+def is_ours(body: bytes) -> bool:
+    """Return whether the body of an answer is a problem document of a Lodestream server."""
+    code = _document(body).get("code")
+    return isinstance(code, str) and code in CODES
+
+
 def passes(error: LodestreamError) -> bool:
     """Return whether the same request may succeed a little later."""
     if isinstance(error, RemoteError):
@@ -115,9 +121,7 @@ def blocks_sockets(error: LodestreamError, *, met: bool) -> bool:
     if isinstance(cause, ws.InvalidStatus):
         # A server that is asked for a stream by a plain GET, since something between took the rest of the handshake
         # away, answers 426. What else it says in its own words it would say by the other transport too.
-        code = _document(bytes(cause.response.body or b"")).get("code")
-        is_ours = isinstance(code, str) and code in CODES
-        return not is_ours or cause.response.status_code in _NO_HANDSHAKE
+        return not is_ours(bytes(cause.response.body or b"")) or cause.response.status_code in _NO_HANDSHAKE
     if _broke_off(error):
         return not met
     return isinstance(error, NoStreamError) or isinstance(cause, ws.InvalidHandshake | ws.InvalidURI)

@@ -13,13 +13,10 @@ from .answers import Answer
 from .bodies import Body
 from .calls import Call, Flow, Pause
 
-__all__ = ["ABSENT", "LEAST", "beginning", "completed"]
+__all__ = ["LEAST", "beginning", "completed", "is_absent"]
 
 #: Bytes from which on an upload is sent in this way: sending less again costs little more than asking does.
 LEAST = 8 << 20
-
-#: Statuses of servers that know no such uploads.
-ABSENT = (404, 405)
 
 _VERSION = {"Tus-Resumable": "1.0.0"}
 _TYPE = "application/offset+octet-stream"
@@ -33,11 +30,19 @@ _LONGEST_PAUSE = 30.0
 # Statuses of `_NoFurtherError`.
 _ELSEWHERE = (409, 423)
 
+# Statuses of servers that know no such uploads.
+_ABSENT = (404, 405)
+
 
 def beginning(body: Body) -> Mapping[str, str]:
     """Return the headers of the request that begins the upload of a body, which has been hashed."""
     metadata = f"sha256 {base64.b64encode(body.sha256.encode()).decode()}"
     return {**_VERSION, "Upload-Length": str(body.size), "Upload-Metadata": metadata}
+
+
+def is_absent(answer: Answer) -> bool:
+    """Return whether a server knows no such uploads. Ours does, so its 404 says that the address is wrong."""
+    return answer.status in _ABSENT and not problems.is_ours(answer.content)
 
 
 def completed(uploads: str, address: str, body: Body) -> Flow[str]:

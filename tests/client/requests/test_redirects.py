@@ -14,7 +14,7 @@ import pytest
 import lodestream as ls
 from lodestream.errors import RemoteProtocolError
 from lodestream_client import AsyncClient, Client
-from lodestream_client.requests import addresses, calls
+from lodestream_client.requests import addresses, calls, resuming
 
 from ..asked import asked
 from ..conftest import Run
@@ -204,6 +204,16 @@ def test_addresses_that_are_none(location: str) -> None:
             Client(server.url).list()
         with pytest.raises(RemoteProtocolError, match="expected an address from"):
             Client(server.url).upload(b"x")
+
+
+@pytest.mark.parametrize("size", [1, resuming.LEAST], ids=["in one", "in parts"])
+def test_a_server_that_does_not_know_its_path_is_told_of(size: int) -> None:
+    """A proxy removes the path from requests: the addresses that the server gives lead elsewhere."""
+    with scripted(lambda asked: Answer(201, b"{}", {"Location": f"{asked.path.removeprefix('/maps')}/ab"})) as server:
+        with pytest.raises(RemoteProtocolError, match=r"such as http://.*LODESTREAM_ROOT_PATH=/maps$"):
+            Client(f"{server.url}/maps").upload(bytes(size))
+        (path,) = {asked.path.partition("?")[0] for asked in server.asked if asked.method != "GET"}
+        assert path == ("/maps/v1/surfaces" if size == 1 else "/maps/v1/uploads")
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lodestream as ls
-from lodestream.errors import InputError, LodestreamError, RemoteProtocolError
+from lodestream.errors import InputError, LodestreamError, NotFoundError, RemoteProtocolError
 from lodestream_client import Client
 from lodestream_client.errors import UnreachableError
 from lodestream_client.requests import resuming
@@ -198,9 +198,16 @@ def test_uploads_arrive_over_links_that_break(seed: int, server: str, monkeypatc
 
 def test_a_server_without_such_uploads_gets_them_in_one(server: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resuming, "LEAST", 1000)
-    monkeypatch.setattr("lodestream_client.requests.addresses._UPLOADS", "/v1/nothing")
+    monkeypatch.setattr("lodestream_client.requests.addresses._UPLOADS", "/v1/names")  # answered 405
     heights = np.random.default_rng(9).normal(size=(30, 20))
     assert Client(server).upload(ls.Surface(heights)).ready
+
+
+def test_where_no_server_is_the_first_answer_is_told(server: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before the whole file is sent, which a server that has answered would not read."""
+    monkeypatch.setattr(resuming, "LEAST", 1000)
+    with pytest.raises(NotFoundError, match="No such address on this server: '/maps/v1/uploads'"):
+        Client(f"{server}/maps").upload(ls.Surface(np.random.default_rng(9).normal(size=(30, 20))))
 
 
 @pytest.mark.long
