@@ -28,7 +28,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from ..store.durable import discard, make_folder, remove
-from ..store.private import make_private
+from ..store.private import make_again
 
 __all__ = ["Work", "tasks_of"]
 
@@ -71,11 +71,9 @@ class Work:
         """
         bands = self.bands(surface)
         with self._lock:
-            if not self._folder.parent.is_dir():  # the scratch folder, which may have been removed
-                make_private(self._folder.parent)
-            for folder in (self._folder, attempt.parent):
-                if not _is_folder(folder):
-                    make_folder(folder)
+            make_again(self._folder)
+            if not _is_folder(attempt.parent):
+                make_folder(attempt.parent)
             if not may_continue:
                 remove(bands)
             if not _is_folder(bands):
