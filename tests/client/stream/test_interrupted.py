@@ -47,7 +47,8 @@ RATE = "400kbit"
 # Bytes that are let come before it is ended; more than what is read at once, so that some of it has been decoded.
 CAME = 100_000
 
-# Half of the file is written, then nothing happens.
+# Half of the file is written, then nothing happens. A signal between two steps of Python ends no sleep that begins then,
+# so that each is short.
 STALLED = """\
 import sys, time, lodestream.formats.writing as formats
 whole = formats.write_stream
@@ -56,7 +57,8 @@ def stall(surface, name, file):
         def write(self, data):
             file.write(bytes(data)[:100])
             file.flush()
-            time.sleep(600)
+            while True:
+                time.sleep(0.05)
     whole(surface, name, Half())
 formats.write_stream = stall
 """
@@ -142,7 +144,7 @@ def command(*arguments: object, before: str = "import sys") -> Iterator[subproce
     """
     program = [sys.executable, "-c", f"{before}\n{MAIN}", *map(str, arguments)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    if "while True" in before:
+    if "lodestream.encode = again" in before:
         environment = {name: value for name, value in environment.items() if not name.startswith("COVERAGE_")}
     process = subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment)
     try:
