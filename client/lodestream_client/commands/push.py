@@ -215,7 +215,9 @@ def _encoded(options: PushOptions, part: Part | None = None) -> Description:
             json=True,
         )
         encode_files(encoding, part, show=lambda _: None)  # the server counts the holes too
-        sent = SurfaceOptions(Quality(), "auto", None, {})
+        # What a name is to lead to has it, and the others have their own in the container.
+        name = options.surface.name if part is None else None
+        sent = SurfaceOptions(Quality(), "auto", name, {})
         return _uploaded(replace(options, files=(str(container),), surface=sent, local=False))
 
 

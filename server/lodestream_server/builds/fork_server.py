@@ -226,6 +226,7 @@ def _stand_alone(parent: int, answer: int) -> None:
         os._exit(1)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
+    os.umask(0o077)  # what it makes is for the server's user alone
     nothing = os.open(os.devnull, os.O_RDWR)
     for standard in (0, 1, 2):  # the log is not its to write
         os.dup2(nothing, standard)

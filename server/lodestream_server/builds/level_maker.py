@@ -285,7 +285,7 @@ def _checked_size(wanted: LevelJob, level: MadeLevel) -> int:
 
 
 def _make_folders(folder: Path) -> None:
-    folder.parent.mkdir(exist_ok=True)
+    folder.parent.mkdir(0o700, exist_ok=True)
     make_folder(folder)
 
 

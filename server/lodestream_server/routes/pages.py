@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse, Response
 
@@ -14,7 +16,7 @@ from ..codes import PAGE
 from . import descriptions, models
 from .documentation import render, render_codes
 from .html_page import html_page
-from .routing import Parts, State, matches, readable
+from .routing import Parts, State, described, matches, readable
 from .sending import SentFile
 
 __all__ = ["router"]
@@ -80,7 +82,7 @@ async def interface(request: Request) -> Response:
 
 
 @readable(router, "/healthz", summary="Alive", responses={200: descriptions.answer("It answers", models.Health)})
-async def get_health() -> Response:
+async def get_health(parts: Parts) -> Response:
     """Answer at once, while the event loop runs."""
     return JSONResponse({"status": "ok", "version": lodestream.__version__})
 
@@ -112,11 +114,14 @@ async def get_readiness(parts: Parts) -> Response:
     "/v1/formats",
     dependencies=[WRITE],
     summary="File formats",
-    responses={200: descriptions.answer("Names of formats", models.Formats)},
+    responses={
+        200: descriptions.answer("Names of formats", models.Formats),
+        304: {"description": "The client has it"},
+    },
 )
-async def list_formats(parts: Parts) -> Response:
+async def list_formats(request: Request, parts: Parts) -> Response:
     """Return the file formats that this server reads; lode are containers. Clients encode other formats themselves."""
-    return JSONResponse({"formats": list(parts.settings.formats)})
+    return described(request, parts, json.dumps({"formats": list(parts.settings.formats)}).encode())
 
 
 @readable(

@@ -62,6 +62,13 @@ def test_push(run: Run, file: Path, server: str, each: tuple[str, ...]) -> None:
     assert np.abs(surface.points - HEIGHTS).max() <= 0.5
 
 
+def test_push_to_a_name_that_stays(run: Run, file: Path, server: str) -> None:
+    code, stdout, stderr = run("push", file, server, "--crs", "EPSG:32611", "--name", "hill", "--replace")
+    assert (code, stdout) == (0, f"{server}/v1/names/hill\n"), stderr
+    with ls.open(f"{server}/v1/names/hill") as container:
+        assert container.info["metadata"]["crs"] == UTM
+
+
 @pytest.mark.parametrize("code", ["EPSG:1", "UTM 11", "EPSG:32611x", "+proj=longlat"])
 def test_what_is_no_crs(run: Run, file: Path, code: str) -> None:
     ended, _, stderr = run("encode", file, file.with_suffix(".lode"), "--crs", code)

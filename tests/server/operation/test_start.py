@@ -278,7 +278,10 @@ def test_what_a_server_makes_is_its_owners_alone(tmp_path: Path) -> None:
         httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         surface = push(http, npy(hills(12, 9)))
-    assert surface["state"] == "ready"
+        assert surface["state"] == "ready"
+        assert http.get(f"{surface['url']}/levels/1").status_code == 200
+        levels = [data / "scratch" / "levels", *(data / "scratch" / "levels").iterdir()]
+        assert [mode(path) for path in levels] == [0o700, 0o600]
     assert mode(data) == 0o700
     assert mode(data / "lock") == 0o600
     places = [data / folder for folder in ("surfaces", "built", "uploads", "containers")]

@@ -49,9 +49,11 @@ TEXTS = {
 }
 WRONG |= {"text": ("", "x", "[]"), "tolerance": ("", "x", "[]", "NaN", "1e999", "-1", "x" * 300)}
 
+PATHS: dict[str, Any] = create_app(Settings(data=Path("nowhere"))).openapi()["paths"]
+
 OPERATIONS = [
     (method, path, parameter)
-    for path, operations in create_app(Settings(data=Path("nowhere"))).openapi()["paths"].items()
+    for path, operations in PATHS.items()
     for method, operation in operations.items()
     for parameter in operation.get("parameters", [])
 ]
@@ -162,8 +164,8 @@ def test_what_is_wrong_with_a_body_is_told_by_its_key(http: httpx.Client, body: 
 
 
 def test_an_unknown_parameter_is_told_with_those_that_there_are(http: httpx.Client, real: dict[str, str]) -> None:
-    for method, path in {(method, path) for method, path, _ in OPERATIONS if method == "get"}:
-        answer = ask(http, real, method, path, {"in": "query", "name": "nope", "value": "1"})
+    for path in (path for path, operations in PATHS.items() if "get" in operations):
+        answer = ask(http, real, "get", path, {"in": "query", "name": "nope", "value": "1"})
         if path.endswith("/stream"):
             assert problem(answer)[0] == 426
             continue

@@ -73,7 +73,7 @@ def test_options_come_in_the_query_or_in_a_form(http: httpx.Client) -> None:
 def test_what_a_client_has_of_a_description_is_not_sent_again(http: httpx.Client) -> None:
     made = push(http, npy(hills(seed=32)), name="one")
     http.put("/v1/names/tagged", json={"surface": made["id"]})
-    for path in (made["url"], "/v1/surfaces", "/v1/names", "/v1/names/tagged"):
+    for path in (made["url"], "/v1/surfaces", "/v1/names", "/v1/names/tagged", "/v1/formats"):
         answer = http.get(path)
         etag = answer.headers["etag"]
         assert answer.headers["cache-control"] == "private, no-cache"
