@@ -6,6 +6,7 @@ from .addresses import open_store
 from .errors import (
     AbsentError,
     ConflictError,
+    DeniedError,
     ExistsError,
     FullError,
     OversizedError,
@@ -21,6 +22,7 @@ __all__ = [
     "AbsentError",
     "Blob",
     "ConflictError",
+    "DeniedError",
     "Entry",
     "ExistsError",
     "Folder",

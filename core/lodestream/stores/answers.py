@@ -63,12 +63,15 @@ class RequestError(Exception):
         ``refused``: the store does not do it, and did nothing. ``unknown``: it is not known what the store did.
     words : str
         For a message, without a credential.
+    denied : bool
+        Whether the caller may not do it.
     """
 
-    def __init__(self, kind: Kind, words: str) -> None:
+    def __init__(self, kind: Kind, words: str, *, denied: bool = False) -> None:
         super().__init__(words)
         self.kind = kind
         self.words = words
+        self.denied = denied
 
 
 _first_process: int | None = None
@@ -154,7 +157,8 @@ def _failure(name: str, absent: bool, text: str) -> RequestError:
     kind = _kind(name, absent, number, code[1] if code else "")
     if kind == "refused" and _RETRIED.search(text):
         kind = "unknown"  # an attempt before may have done it
-    return RequestError(kind, _words(name, text, number, code[1] if code else "", known))
+    denied = _is_denied(name, number, code[1] if code else "")
+    return RequestError(kind, _words(name, text, number, code[1] if code else "", known), denied=denied)
 
 
 def _kind(name: str, absent: bool, status: int | None, code: str) -> Kind:
@@ -166,6 +170,11 @@ def _kind(name: str, absent: bool, status: int | None, code: str) -> Kind:
         return "refused"
     definite = ("PermissionDeniedError", "UnauthenticatedError", "NotSupportedError", "InvalidPathError", "ValueError")
     return "refused" if name in (*definite, "UnknownConfigurationKeyError", "TypeError") else "unknown"
+
+
+def _is_denied(name: str, status: int | None, code: str) -> bool:
+    denials = ("PermissionDeniedError", "UnauthenticatedError")
+    return status in (401, 403) or code in (*_DENIED, *_EXPIRED) or name in denials
 
 
 def _words(name: str, text: str, status: int | None, code: str, known: str) -> str:
@@ -180,11 +189,7 @@ def _words(name: str, text: str, status: int | None, code: str, known: str) -> s
         return f"there is no such bucket or container ({known})"
     if code in _OTHER_REGION or (status is not None and 300 <= status < 400) or "redirect" in text:
         return f"the bucket is elsewhere ({known or 'redirected'}): set AWS_REGION to its region"
-    if (
-        status in (401, 403)
-        or code in (*_DENIED, *_EXPIRED)
-        or name in ("PermissionDeniedError", "UnauthenticatedError")
-    ):
+    if _is_denied(name, status, code):
         return f"the store refuses access ({known or name}): {_CREDENTIALS}"
     if name == "InvalidPathError":
         key = _UNLISTED.search(text)

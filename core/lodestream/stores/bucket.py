@@ -26,6 +26,7 @@ from .connections import LONGEST_PAUSE, Limits, connected, endpoint_of, parsed
 from .errors import (
     AbsentError,
     ConflictError,
+    DeniedError,
     ExistsError,
     OversizedError,
     StoreError,
@@ -296,7 +297,7 @@ class Bucket:
         """Raise what a failure is for whoever reads, or writes what may be repeated."""
         if failure.kind == "absent":
             raise AbsentError(f"{self.describe()}: there is no {key}") from None
-        raise StoreError(f"{self._named(key)}: {failure.words}") from None
+        raise (DeniedError if failure.denied else StoreError)(f"{self._named(key)}: {failure.words}") from None
 
     def _read(self, at: str, most: int, tag: str | None = None) -> tuple[bytes | None, str | None] | None:
         """Return the bytes of an object, or None if they are too many, and its tag; None if it still has a tag."""

@@ -6,6 +6,7 @@
     ├── AbsentError                   there is no such object
     ├── ExistsError                   there is one already, so none was created
     ├── ConflictError                 the object has another tag than the one that was read
+    ├── DeniedError                   the caller may not have the object, or nothing at all
     ├── UnacknowledgedError           the write may have taken place, or may still
     ├── FullError                     there is no space left
     ├── OversizedError                the object is larger than it may be
@@ -22,6 +23,7 @@ from .interface import Tag
 __all__ = [
     "AbsentError",
     "ConflictError",
+    "DeniedError",
     "ExistsError",
     "FullError",
     "OversizedError",
@@ -49,6 +51,10 @@ class ConflictError(StoreError):
     After a lost answer it may hide a write that took place: another writer replaced it before it was read back. So a
     change must be harmless when it is done twice: a state, not a counter.
     """
+
+
+class DeniedError(StoreError):
+    """The store refuses access: to one object, such as one that was moved to an archive, or to everything."""
 
 
 class UnacknowledgedError(StoreError):

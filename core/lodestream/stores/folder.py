@@ -28,6 +28,7 @@ from ..operating_system import (
 from .errors import (
     AbsentError,
     ConflictError,
+    DeniedError,
     ExistsError,
     FullError,
     OversizedError,
@@ -438,7 +439,8 @@ class Folder:
             raise StoreError(
                 f"{place}: {error.strerror}: a program may have it open: close that, and try again"
             ) from error
-        raise StoreError(f"{place}: {error.strerror or error}") from error
+        denied = isinstance(error, PermissionError)
+        raise (DeniedError if denied else StoreError)(f"{place}: {error.strerror or error}") from error
 
 
 class FileBlob:

@@ -39,7 +39,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from lodestream.errors import InputError, LodestreamError
 from lodestream.series import SERIES, place_of
-from lodestream.stores import OversizedError, Store, Tag
+from lodestream.stores import DeniedError, OversizedError, Store, Tag
 from lodestream.stores.keys import is_key
 
 __all__ = [
@@ -70,6 +70,7 @@ __all__ = [
     "describe",
     "dump",
     "id_of",
+    "kept_back",
     "manifest_key",
     "name_key",
     "name_of",
@@ -429,6 +430,18 @@ def read_if(store: Store, key: str, tag: Tag | None) -> tuple[bytes, Tag] | None
         return store.get_if(key, tag)
     except OversizedError as error:
         return b"", error.tag
+
+
+def kept_back(store: Store, error: DeniedError) -> DamagedObjectError:
+    """Return what is wrong with an object that the store does not give, though it gives others.
+
+    Raises
+    ------
+    StoreError
+        If it gives none: then this says nothing about the object.
+    """
+    store.get(IDENTITY)
+    return DamagedObjectError(str(error))
 
 
 def parse(kind: type[T], key: str, data: bytes) -> T:

@@ -18,7 +18,7 @@ from operator import itemgetter
 from typing import TYPE_CHECKING
 
 from lodestream.errors import InputError, LodestreamError, NotFoundError
-from lodestream.stores import AbsentError, StoreError, Tag, UnacknowledgedError
+from lodestream.stores import AbsentError, DeniedError, StoreError, Tag, UnacknowledgedError
 
 from ..problems import DamagedNameError, NotOwnerError, StandbyError
 from . import layout
@@ -308,8 +308,9 @@ class Names:
         except AbsentError:
             self._surfaces.index.drop_name(key)
             return None
-        except DamagedObjectError as error:
-            _log.error("%s; it is left as it is, and no replaced surface is deleted", error)
+        except (DamagedObjectError, DeniedError) as error:
+            wrong = layout.kept_back(self._store, error) if isinstance(error, DeniedError) else error
+            _log.error("%s; it is left as it is, and no replaced surface is deleted", wrong)
         # One that cannot be read is told each time, until it is replaced.
         self._surfaces.index.put_name(key, name, seen if found is not None else None)
         return found

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from lodestream.errors import InputError, LodestreamError, NotFoundError
-from lodestream.stores import AbsentError, Entry, ExistsError, Store, StoreError, Tag, UnacknowledgedError
+from lodestream.stores import AbsentError, DeniedError, Entry, ExistsError, Store, StoreError, Tag, UnacknowledgedError
 from lodestream.stores.threads import Threads
 
 from ..problems import ReadOnlyError, StandbyError
@@ -823,6 +823,12 @@ class Surfaces:
 
     def _stored(self, surface: str) -> _Stored | None:
         """Read what the store has of a surface; None if there is none."""
+        try:
+            return self._looked_at(surface)
+        except DeniedError as error:
+            return _Stored(None, None, layout.kept_back(self.store, error))
+
+    def _looked_at(self, surface: str) -> _Stored | None:
         key = layout.manifest_key(surface)
         try:
             manifest = layout.parse(Manifest, key, layout.read(self.store, key)[0])

@@ -21,7 +21,7 @@ import pytest
 from obstore.store import S3Store
 
 from lodestream.errors import LodestreamError
-from lodestream.stores import AbsentError, Store, StoreError, Tag, UnfitStoreError, open_store
+from lodestream.stores import AbsentError, DeniedError, Store, StoreError, Tag, UnfitStoreError, open_store
 from lodestream.stores.answers import ask
 from lodestream.stores.bucket import Bucket
 from lodestream.stores.connections import Limits
@@ -176,7 +176,7 @@ def test_a_delete_that_failed_deletes_nothing_afterwards(s3: Emulator, monkeypat
         assert gate.wait(PATIENCE)
 
     monkeypatch.setattr(obstore, "delete", delete)
-    with pytest.raises(StoreError, match="refuses access"):
+    with pytest.raises(DeniedError, match="refuses access"):
         store.delete(map(str, range(100)))
     assert gate.is_set(), "those under way are waited for"
     assert len(begun) < 100, "others do not begin"

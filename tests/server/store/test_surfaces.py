@@ -11,7 +11,7 @@ import tempfile
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, cast, get_args
 from unittest.mock import Mock
@@ -29,7 +29,8 @@ from hypothesis.stateful import (
 )
 
 from lodestream.errors import InputError, NotFoundError
-from lodestream.stores import Folder, FullError, Store, StoreError, Tag, UnacknowledgedError
+from lodestream.stores import SMALL, DeniedError, Folder, FullError, Store, StoreError, Tag, UnacknowledgedError
+from lodestream_server.problems import DamagedNameError
 from lodestream_server.store import layout
 from lodestream_server.store.identity import establish
 from lodestream_server.store.index import LEAST, Index, IndexLostError
@@ -193,6 +194,65 @@ def test_the_same_upload_again(surfaces: Surfaces, tmp_path: Path) -> None:
     assert surfaces.accept(manifest, files)[1], "it is built again, from the bytes that came"
     with surfaces.store.open(layout.upload_key(manifest.upload, 0)) as blob:
         assert blob.read(0, blob.size) == body
+
+
+class Withholding(Folder):
+    """A store that does not give some of its objects, whoever asks: those that were moved to an archive."""
+
+    withheld: tuple[str, ...] = ()
+
+    def get(self, key: str, most: int = SMALL) -> tuple[bytes, Tag]:
+        if key.startswith(self.withheld):
+            raise DeniedError(f"{key}: the store refuses access")
+        return super().get(key, most)
+
+
+def test_an_object_that_the_store_does_not_give_stops_nobody(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    store = Withholding(tmp_path / "data")
+    with closing(Surfaces(store, tmp_path / "before.sqlite")) as surfaces:
+        surfaces.sync()
+        for number in range(3):
+            manifest, files = upload(tmp_path, number)
+            surfaces.accept(manifest, files)
+            build(surfaces, manifest, tmp_path)
+            surfaces.names.point(f"name{number}", manifest.id, None, lambda _: True, 1.0)
+    withheld = [layout.manifest_key(f"{0:020x}"), layout.built_key(f"{1:020x}"), layout.name_key("name0")]
+    store.withheld = tuple(withheld)
+    with closing(Surfaces(store, tmp_path / "index.sqlite")) as surfaces:
+        surfaces.sync()
+        assert surfaces.is_current
+        assert [surfaces.index.find(f"{number:020x}") is not None for number in range(3)] == [False, False, True]
+        assert surfaces.names.get("name2").surface == f"{2:020x}"
+        with pytest.raises(DamagedNameError):
+            surfaces.names.get("name0")
+        assert [key for key in withheld if f"{key}: the store refuses access; " not in caplog.text] == []
+        with pytest.raises(DamagedObjectError, match="so nothing is removed"):
+            surfaces.collect(older=-3600)
+        store.withheld = ()
+        surfaces.sync()
+        assert [surfaces.get(f"{number:020x}").state for number in range(3)] == ["ready"] * 3
+        assert surfaces.names.get("name0").surface == f"{0:020x}"
+        assert surfaces.collect(older=-3600) == []
+
+        store.withheld = tuple(withheld)
+        for key in withheld[1:]:  # they change, and what is known of them stays
+            with (tmp_path / "data" / key).open("ab") as file:
+                file.write(b"\n")
+        surfaces.sync()
+        assert surfaces.get(f"{1:020x}").state == "ready"
+
+
+def test_a_store_that_gives_nothing_is_not_taken_for_one_without_surfaces(tmp_path: Path) -> None:
+    store = Withholding(tmp_path / "data")
+    with closing(Surfaces(store, tmp_path / "before.sqlite")) as surfaces:
+        surfaces.sync()
+        surfaces.accept(*upload(tmp_path, 0))
+    surfaces = Surfaces(store, tmp_path / "index.sqlite")
+    store.withheld = ("",)
+    with pytest.raises(DeniedError):
+        surfaces.sync()
+    assert not surfaces.is_synced
+    surfaces.close()
 
 
 class Unanswered:
