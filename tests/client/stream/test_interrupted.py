@@ -47,8 +47,8 @@ RATE = "400kbit"
 # Bytes that are let come before it is ended; more than what is read at once, so that some of it has been decoded.
 CAME = 100_000
 
-# Half of the file is written, then nothing happens. A signal between two steps of Python ends no sleep that begins then,
-# so that each is short.
+# Half of the file is written, then nothing happens. A signal between two steps of Python ends no sleep that begins
+# then, so that each is short.
 STALLED = """\
 import sys, time, lodestream.formats.writing as formats
 whole = formats.write_stream
