@@ -87,7 +87,8 @@ _LOCAL_NAMES = """
 _LOCAL = {getattr(errno, name) for name in _LOCAL_NAMES.split() if hasattr(errno, name)}
 
 _SHORT_OF_MEMORY = re.compile(
-    r"memory alloc|cannot allocate|can't allocate|unable to allocate|out of memory|bad_alloc|filter returned failure",
+    r"memory alloc|(?:cannot|can't|unable to|failed to) allocate|(?:out of|not enough|insufficient|no) memory|"
+    r"no space (?:for|to)|bad_alloc|filter returned failure",
     re.IGNORECASE,
 )
 
@@ -295,7 +296,7 @@ def may_pass(error: LodestreamError) -> bool:
         # Errors of GDAL have numbers of its own as `errno`: what is damaged has that of EPERM.
         if isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno in _LOCAL):
             return True
-        # HDF5 and GDAL's drivers say it in words only; a filter fails for want of memory as for damage.
+        # HDF5 and the libraries below GDAL say it in words only; a filter fails for want of memory as for damage.
         if type(cause).__name__ == _NO_MEMORY_OF_GDAL or _SHORT_OF_MEMORY.search(str(cause)):
             return True
     return False

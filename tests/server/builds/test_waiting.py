@@ -6,10 +6,13 @@ import asyncio
 import errno
 import logging
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
 
 from lodestream.errors import FormatError, TooLargeError, UnavailableError
@@ -21,6 +24,7 @@ from lodestream_server.builds.results import check as results_check
 from lodestream_server.maintenance.check import check
 from lodestream_server.maintenance.waiting import retry, waiting
 from lodestream_server.store.uploads import check_upload
+from tests.patience import PATIENCE
 from tests.server.builds import slow
 from tests.server.builds.test_builds import building, running
 from tests.server.helpers import eventually, hills, kept, npy, problem, push, settled, upload_of
@@ -59,10 +63,76 @@ def test_a_reason_that_is_not_in_the_bytes_may_pass(cause: Exception, monkeypatc
 
 def test_memory_that_gdal_lacks_may_pass() -> None:
     """Its number is that of a missing file, and its words are those of a driver."""
-    lacking = pytest.importorskip("rasterio._err").CPLE_OutOfMemoryError(3, 2, "Failed to allocate the block cache")
+    lacking = pytest.importorskip("rasterio._err").CPLE_OutOfMemoryError(3, 2, "There is none for the block cache")
     refused = FormatError("GDAL cannot read this GeoTIFF")
     refused.__context__ = lacking
     assert worker.may_pass(refused)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "TIFFFillStrip:No space for data buffer at scanline 4294967295",
+        "ZSTDDecode:Error in ZSTD_decompressStream(): Allocation error : not enough memory",
+        "LERCPreDecode:Cannot allocate buffer",
+        "JPEGLib:Insufficient memory (case 4)",
+        "Failed to allocate memory for tile buffer (1 elements of 4096 bytes each)",
+        "No space to expand strip arrays",
+    ],
+)
+def test_memory_that_a_library_of_gdal_lacks_may_pass(words: str) -> None:
+    """To GDAL it is any error."""
+    refused = FormatError("GDAL cannot read this GeoTIFF")
+    refused.__context__ = pytest.importorskip("rasterio._err").CPLE_AppDefinedError(3, 1, words)
+    assert worker.may_pass(refused)
+
+
+# Reads a file with ever more memory, in processes of their own, and prints what became of it.
+LIMITED = """
+import os, resource, sys
+from lodestream.errors import LodestreamError
+from lodestream.formats import read
+from lodestream_server.builds.worker import may_pass
+
+def outcome(more):
+    with open("/proc/self/status") as status:
+        (has,) = (int(line.split()[1]) << 10 for line in status if line.startswith("VmData"))
+    resource.setrlimit(resource.RLIMIT_DATA, (has + more, has + more))
+    try:
+        read(sys.argv[2])
+    except MemoryError:
+        return 1
+    except LodestreamError as error:
+        return 2 if may_pass(error) else 3
+    return 0
+
+read(sys.argv[1])  # what it takes to read any is there
+found = []
+while not found or found[-1] != 0:
+    child = os.fork()
+    if child == 0:
+        os.close(2)
+        os._exit(outcome(len(found) << 21))
+    found.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+print(*found)
+"""
+
+
+@pytest.mark.parametrize("compress", ["deflate", "zstd"])
+def test_however_little_memory_there_is_no_raster_is_refused_for_good(tmp_path: Path, compress: str) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    large, small = tmp_path / "large.tif", tmp_path / "small.tif"
+    for path, size in ((large, 1500), (small, 20)):
+        heights = np.random.default_rng(7).random((size, size), np.float32)
+        place = rasterio.Affine(30, 0, 500_000, 0, -30, 4_000_000)
+        profile = {"driver": "GTiff", "count": 1, "dtype": "float32", "transform": place, "compress": compress}
+        with rasterio.open(path, "w", height=size, width=size, blockysize=size, **profile) as dataset:
+            dataset.write(heights, 1)
+    program = [sys.executable, "-c", LIMITED, str(small), str(large)]
+    said = subprocess.run(program, stdout=subprocess.PIPE, check=True, timeout=PATIENCE, text=True).stdout
+    outcomes = {int(word) for word in said.split()}
+    assert 3 not in outcomes, said
+    assert 2 in outcomes, said  # GDAL lacked it
 
 
 def test_a_raster_that_is_cut_short_is_refused_for_good(tmp_path: Path) -> None:
