@@ -125,7 +125,15 @@ class PartialUpload:
     @property
     def is_lost(self) -> bool:
         """Whether its bytes were removed by somebody else, with the scratch folder."""
-        return self.declared.surface is None and not (self.folder / _DATA).exists()
+        if self.declared.surface is not None:
+            return False
+        try:
+            os.stat(self.folder / _DATA)  # what says only whether it is there would take an error of the disk for a no
+        except (FileNotFoundError, NotADirectoryError):
+            return True
+        except OSError:  # nobody knows now
+            return False
+        return False
 
     async def make(self) -> None:
         """Make its folder.

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import hashlib
+import os
 import shutil
 import stat
 import tempfile
@@ -306,6 +308,31 @@ def test_what_was_removed_by_somebody_else_is_missing(tmp_path: Path, sent_befor
         assert stat.S_IMODE(folder.parent.stat().st_mode) == 0o700
 
     run(folder, test)
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.EACCES])
+def test_what_cannot_be_looked_at_now_is_not_taken_for_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    async def test(uploads: PartialUploads, it: PartialUpload) -> None:
+        await sent(it, 0, BODY[:20])
+        old = await uploads.create(DECLARED)
+        old.touched = 0.0
+        look = os.stat
+
+        def failing(path: Any, *given: Any, **options: Any) -> os.stat_result:
+            if path == it.folder / "0":
+                raise OSError(number, os.strerror(number))
+            return look(path, *given, **options)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "stat", failing)
+            await uploads.expire()
+        assert [path.name for path in tmp_path.iterdir()] == [it.id]  # what is due goes
+        await sent(it, 20, BODY[20:])
+        assert it.is_complete
+
+    run(tmp_path, test)
 
 
 def test_one_whose_folder_is_removed_while_it_begins_may_begin_again(
