@@ -131,7 +131,10 @@ class Upkeep:
 
     async def _expire_uploads(self) -> None:
         while True:
-            await self._partial_uploads.expire()
+            try:
+                await self._partial_uploads.expire()
+            except Exception:  # whatever it is, nobody else would do this work
+                _log.exception("uploads in parts that are due cannot be removed now, which is tried again")
             await asyncio.sleep(_EXPIRE_SECONDS)
 
     async def _collect(self) -> None:

@@ -14,6 +14,7 @@ import pytest
 
 from lodestream.stores import Folder, StoreError
 from lodestream_server import running_server
+from lodestream_server.store.partial_uploads import PartialUploads
 from lodestream_server.store.surfaces import Surfaces
 from tests.server.helpers import PATIENCE, eventually, hills, listed, npy, problem, push, settled
 from tests.stores.memory import memory
@@ -174,3 +175,23 @@ def test_a_server_whose_bucket_cannot_be_listed_says_so(
             broken.undo()
             eventually(lambda: http.get("/readyz").json()["index"] == "current", "the list")
             eventually(lambda: http.get("/readyz").json()["role"] == "writer", "it to write")
+
+
+def test_uploads_in_parts_are_removed_again_after_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("lodestream_server.upkeep._EXPIRE_SECONDS", 0.01)
+    failures, expire = [RuntimeError("can't start new thread")], PartialUploads.expire
+
+    async def failing(uploads: PartialUploads) -> None:
+        if failures:
+            raise failures.pop()
+        await expire(uploads)
+
+    with running_server(tmp_path, workers=1, partial_seconds=0.01) as url, client(url) as http:
+        monkeypatch.setattr(PartialUploads, "expire", failing)
+        eventually(lambda: not failures, "an error")
+        headers = {"tus-resumable": "1.0.0", "upload-length": "9"}
+        assert http.post("/v1/uploads", headers=headers).status_code == 201
+        eventually(lambda: not list((tmp_path / "scratch" / "partial").iterdir()), "the upload to be removed")
+    assert "can't start new thread" in caplog.text
