@@ -124,14 +124,14 @@ class ContainerCache:
             file = FileBlob(lease.path, lease.path.open("rb"))
         except OSError as error:
             lease.release()
-            self._forget(sha256, error)
+            self._give_up(sha256, lease.path, error)
             return None
         if file.size != size:
             file.close()
             lease.release()
-            self._forget(sha256, f"expected {size} bytes, got {file.size}")
+            self._give_up(sha256, lease.path, f"expected {size} bytes, got {file.size}")
             return None
-        return _CachedBlob(file, lease, self._instead(sha256, size))
+        return _CachedBlob(file, lease, self._instead(sha256, size, lease.path))
 
     @contextmanager
     def local(self, sha256: str, size: int) -> Iterator[Path]:
@@ -174,15 +174,15 @@ class ContainerCache:
         """Remove the file of a container, when nobody reads it any more."""
         self._files.forget(lambda key: key == sha256)
 
-    def _forget(self, sha256: str, problem: object) -> None:
-        _log.warning("the container %s is fetched again: its file cannot be used: %s", sha256, problem)
-        self.forget(sha256)
+    def _give_up(self, sha256: str, path: Path, problem: object) -> None:
+        if self._files.give_up(sha256, path):
+            _log.warning("the container %s is fetched again: its file cannot be used: %s", sha256, problem)
 
-    def _instead(self, sha256: str, size: int) -> Callable[[StoreError], Blob]:
+    def _instead(self, sha256: str, size: int, path: Path) -> Callable[[StoreError], Blob]:
         """Return what opens the container in the store when its file cannot be read."""
 
         def opened(error: StoreError) -> Blob:
-            self._forget(sha256, error)
+            self._give_up(sha256, path, error)
             return self._store.open(layout.container_key(sha256), size)
 
         return opened

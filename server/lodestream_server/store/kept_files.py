@@ -111,6 +111,17 @@ class KeptFiles(Generic[_Key]):
             if not file.readers:
                 discard(file.path)
 
+    def give_up(self, key: _Key, path: Path) -> bool:
+        """Forget the file of a key, if it is this one: another one may have its place; return whether it was."""
+        with self._lock:
+            file = self._files.get(key)
+            if file is None or file.path != path:
+                return False
+            self._drop(key)
+        if not file.readers:
+            discard(path)
+        return True
+
     def _oldest(self, most: int) -> _File | None:
         with self._lock:
             if self.size > most:

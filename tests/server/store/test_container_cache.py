@@ -305,6 +305,26 @@ def test_whoever_reads_on_from_a_file_that_was_cut_short_spares_the_one_in_its_p
     assert caplog.text.count("is fetched again") == 1
 
 
+def test_everybody_who_reads_from_a_file_that_was_cut_short_spares_the_one_in_its_place(
+    world: World, caplog: pytest.LogCaptureFixture
+) -> None:
+    name, data = world.put()
+    cache = world.cache()
+    keep(cache, name)
+    first, second = (cache.open(name, SIZE) or pytest.fail("it is not there") for _ in range(2))
+    with first, second:
+        (path,) = world.files.iterdir()
+        os.truncate(path, 1000)
+        assert first.read(900, 200) == data[900:1100]
+        with cache.local(name, SIZE):
+            pass
+        assert second.read(900, 200) == data[900:1100]
+        assert name in cache
+    assert world.has(name) == [True]
+    assert world.remote.fetched == [f"containers/{name}.lode"] * 2
+    assert caplog.text.count("is fetched again") == 1
+
+
 def test_the_end_of_a_server_gives_up_what_is_being_fetched(world: World, caplog: pytest.LogCaptureFixture) -> None:
     name, _ = world.put()
     cache = world.cache()
