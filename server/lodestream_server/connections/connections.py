@@ -288,6 +288,9 @@ class _Stream(WebSocketsSansIOProtocol, asyncio.BufferedProtocol):
 
     def resume_writing(self) -> None:
         super().resume_writing()
+        self._send_pong()
+
+    def _send_pong(self) -> None:
         pong, self._pong = self._pong, b""
         if pong:
             self.transport.write(pong)
@@ -300,6 +303,10 @@ class _Stream(WebSocketsSansIOProtocol, asyncio.BufferedProtocol):
         else:
             # With the first ping of a read come the pongs of all of them, and with the others none.
             self._pong = b"".join(self.conn.data_to_send()) or self._pong
+
+    def handle_close(self, event: Frame) -> None:
+        self._send_pong()  # if one read has brought both, the answer to this is behind it
+        super().handle_close(event)
 
     def handle_pong(self, event: Frame) -> None:
         super().handle_pong(event)

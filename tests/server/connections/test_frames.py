@@ -24,7 +24,7 @@ from lodestream.protocol.messages import Credit, End, Error, Event, Open
 from lodestream.protocol.wire import serialize
 from lodestream_server import running, running_server
 from lodestream_server.connections import connections
-from tests.server.connections.sockets import CONTINUATION, PING, PONG, Frames, Place, frame, handshake
+from tests.server.connections.sockets import CLOSE, CONTINUATION, PING, PONG, Frames, Place, frame, handshake
 from tests.server.helpers import PATIENCE, Keys, Raw, eventually, hills, in_time, npy, push, raw_stream
 
 
@@ -99,6 +99,25 @@ def test_of_pongs_that_nobody_takes_the_last_one_waits(
                 assert int(payload) > last
                 last, answered = int(payload), answered + 1
         assert answered < number
+
+
+def test_who_leaves_before_it_has_read_its_pongs_is_answered(
+    tmp_path: Path, keys: Keys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "_FRAMES", 1e9)
+    monkeypatch.setattr(running, "_PING_INTERVAL", PATIENCE)
+    settings: dict[str, Any] = {"workers": 1, "token_file": keys.folder / "tokens.json", "head_seconds": PATIENCE}
+    with running_server(tmp_path, **settings) as url, opened(f"{url}/v1/surfaces/{'0' * 20}", 4096) as connection:
+        stream = stream_of(connection)
+        while stream.writable.is_set():
+            connection.sendall(frame(b"%0125d" % 0, PING) * 500)
+        eventually(lambda: not unread(connection, stream.transport), "all to be read by the server")
+        connection.sendall(frame(b"last", PING) + frame(struct.pack(">H", 1000), CLOSE))  # which one read brings
+        eventually(lambda: not unread(connection, stream.transport), "the end to be read by the server")
+        found, frames = Frames(), list[tuple[int, bytes]]()
+        while data := connection.recv(1 << 20):
+            frames += found.feed(data)
+    assert frames[-2:] == [(PONG, b"last"), (CLOSE, struct.pack(">H", 1000))]
 
 
 def test_a_stream_is_read_little_by_little(server: str, surface: dict[str, Any]) -> None:

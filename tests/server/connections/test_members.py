@@ -31,6 +31,7 @@ OVERRIDDEN: dict[type, dict[str, tuple[list[str], bool]]] = {
         "send": (["message"], True),
         "resume_writing": ([], False),
         "handle_ping": ([], False),
+        "handle_close": (["event"], False),
         "handle_pong": (["event"], False),
         "handle_cont": (["event"], False),
     },
