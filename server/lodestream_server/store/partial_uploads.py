@@ -398,9 +398,11 @@ def _found(folder: Path) -> Iterator[PartialUpload]:
                 raise ValueError("it has another name")
             declared = _adapter().validate_json((path / _DECLARED).read_bytes())
             yield PartialUpload(path, declared, *_reached(path, declared))
-        except (OSError, ValidationError, ValueError) as error:
+        except (FileNotFoundError, NotADirectoryError, IsADirectoryError, ValidationError, ValueError) as error:
             _log.info("%s is no upload that can go on, and is removed: %s", path, str(error).partition("\n")[0])
             discard(path)
+        except OSError as error:  # which says nothing of what was sent
+            _log.error("%s cannot be read now, and is left for the next start: %s", path, error.strerror)
 
 
 def _reached(folder: Path, declared: Declared) -> tuple[int, float]:

@@ -410,3 +410,18 @@ def test_what_is_no_upload_is_removed(tmp_path: Path, name: str, content: bytes 
         (tmp_path / name / "upload.json").write_bytes(content)
     assert on(tmp_path).count(None) == (0, 0)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_cannot_be_read_at_a_start_is_found_at_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def test(uploads: PartialUploads, it: PartialUpload) -> None:
+        await sent(it, 0, BODY[:20])
+
+        def failing(path: Path) -> bytes:
+            raise OSError(errno.EIO, "Input/output error")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "read_bytes", failing)
+            assert on(tmp_path).count(None) == (0, 0)
+        assert on(tmp_path).get(it.id, "anna").offset == 20
+
+    run(tmp_path, test)
