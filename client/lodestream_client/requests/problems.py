@@ -164,7 +164,7 @@ def from_connection(error: Exception, url: str) -> LodestreamError:
     if untrusted := _first(error, ssl.SSLCertVerificationError):
         return UnreachableError(
             f"no secure connection to {url}: its certificate is not trusted here ({untrusted.verify_message}); the "
-            "environment variable SSL_CERT_FILE names a file with further authorities"
+            "environment variable SSL_CERT_FILE names a file with all authorities that are, in place of the usual ones"
         )
     if insecure := _first(error, ssl.SSLError):
         return UnreachableError(f"no secure connection to {url}: {insecure.strerror or insecure}")

@@ -49,13 +49,22 @@ def host(tmp_path: Path) -> Iterator[str]:
 
 
 def test_a_certificate_that_is_not_trusted_is_told_as_such(host: str) -> None:
-    told = "no secure connection to .*certificate is not trusted here .self.signed certificate.; .* SSL_CERT_FILE"
+    told = "no secure .*certificate is not trusted here .self.signed certificate.; .* SSL_CERT_FILE .* in place"
     with Client(host) as client, pytest.raises(UnreachableError, match=told):
         list(client.list())
     with Client(host) as client, pytest.raises(UnreachableError, match=told):
         list(client.connect(f"{host}/v1/surfaces/hill"))
     with pytest.raises(UnreachableError, match=told):
         ls.open(f"{host}/hill.lode")
+
+
+def test_the_authorities_of_the_environment_take_the_place_of_the_usual_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which is what the message about a certificate says of them."""
+    certificate, _ = self_signed(tmp_path)
+    monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+    assert len(httpx.create_ssl_context().get_ca_certs()) == 1
 
 
 def test_an_answer_that_does_not_come_is_no_fault_of_the_certificate(tmp_path: Path) -> None:
