@@ -48,7 +48,12 @@ _Encoding = Annotated[
     Query(description="how heights are colours; shade is a relief for the eye"),
 ]
 _Size = Annotated[Literal["256", "512"], Query(description="pixels along an edge")]
-_Height = Annotated[float, Query(ge=-20_000, le=20_000, description="metres where there are no heights")]
+_Height = Annotated[
+    float, Query(ge=-20_000, le=20_000, allow_inf_nan=False, description="metres where there are no heights")
+]
+_Offset = Annotated[
+    float, Query(ge=-20_000, le=20_000, allow_inf_nan=False, description="metres by which all heights are lifted")
+]
 _Scale = Annotated[
     float | None,
     Query(allow_inf_nan=False, description="metres upwards of one unit of the heights; by default as the surface says"),
@@ -108,7 +113,7 @@ def _mapped(
                 name=f"get_{place[1:-1]}_{route.__name__}",
                 summary=f"{summary} of {whose}",
                 response_class=response_class,
-                responses={200: answer, **_ERRORS},
+                responses={200: answer, 304: {"description": "The client has it"}, **_ERRORS},
             )(route)
         return route
 
@@ -184,7 +189,7 @@ async def layer_json(
     request: Request,
     parts: Parts,
     found: _Found,
-    offset: _Height = 0.0,
+    offset: _Offset = 0.0,
     nodata: _Height = 0.0,
     scale: _Scale = None,
     error: _Error = "0",
@@ -210,7 +215,7 @@ async def mesh(
     z: _Zoom,
     x: _Place,
     y: _Place,
-    offset: _Height = 0.0,
+    offset: _Offset = 0.0,
     nodata: _Height = 0.0,
     scale: _Scale = None,
     error: _Error = "0",

@@ -123,3 +123,21 @@ def test_what_the_document_says_is_what_happens(
     assert statuses.total() > 0
     assert max(statuses) < 500
     assert [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR] == []
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_no_two_parameters_of_a_query_are_described_alike(name: str) -> None:
+    parameters = [it.definition for it in OPERATIONS[name].query]
+    described = [it["description"] for it in parameters]
+    assert len(set(described)) == len(described), described
+
+
+def test_what_is_answered_with_a_tag_may_be_answered_that_the_client_has_it(server: Server) -> None:
+    parts = {"level": 0, "z": 0, "x": 0, "y": 0, "image": "png", **server.real("get")}
+    tagged = set(MAPS)  # the surface has no CRS, and so none of these
+    for name, operation in OPERATIONS.items():
+        if operation.method == "get" and "etag" in server.http.get(operation.path.format(**parts)).headers:
+            tagged.add(name)
+    assert len(tagged) > len(MAPS) + 6
+    for name in tagged:
+        assert "304" in OPERATIONS[name].definition.raw["responses"], name
