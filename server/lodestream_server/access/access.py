@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ipaddress
 import re
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -229,8 +230,8 @@ def is_loopback(host: str) -> bool:
 
 def _creation(settings: Settings) -> str:
     """Return the command that makes a token for this server."""
-    place = f"--token-file {settings.token_file}" if settings.token_file else f"--data {settings.data}"
-    return f"lodestream token create NAME --scope write {place}"
+    place = ("--token-file", settings.token_file) if settings.token_file else ("--data", settings.data)
+    return f"lodestream token create NAME --scope write {shlex.join(map(str, place))}"
 
 
 def _is_own(origin: str, connection: HTTPConnection) -> bool:

@@ -169,9 +169,9 @@ def test_what_can_be_made_again_may_be_elsewhere(tmp_path: Path, other_disk: boo
 
 
 def test_the_command_that_makes_the_first_token_is_told_whole(tmp_path: Path, refused: Refused) -> None:
-    data, file = tmp_path / "data", tmp_path / "tokens"
+    data, file = tmp_path / "the data", tmp_path / "tokens"
     told = "create one with `lodestream token create NAME --scope write"
-    assert f"{told} --data {data}`" in refused("serve", "--host", "0.0.0.0", "--data", data)
+    assert f"{told} --data '{data}'`" in refused("serve", "--host", "0.0.0.0", "--data", data)
     line = refused("serve", "--origins", "*", "--data", data, "--token-file", file)
     assert f"{told} --token-file {file}`" in line
 
