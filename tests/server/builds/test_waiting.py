@@ -111,7 +111,7 @@ found = []
 while not found or found[-1] != 0:
     child = os.fork()
     if child == 0:
-        os.close(2)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         os._exit(outcome(len(found) << 21))
     found.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 print(*found)
