@@ -395,6 +395,8 @@ describe("a link that breaks", () => {
     [206, { etag: '"0123' }],
     [206, { "content-range": "bytes 0-" }],
     [206, { "content-range": "bytes 0-99/1" }],
+    [301, {}],
+    [307, { "content-length": "0" }],
   ])("in the head of an answer of status %s and %j is not the end", async (status, headers) => {
     let asked = 0;
     const cut: typeof fetch = async (input, init) => {

@@ -67,7 +67,9 @@ export function fromResponse(status: number, reason: string, body: string, url: 
  * of a head as if it were whole: a status of 20, a range without its last digits.
  */
 export function isCutShort({ status, ok, headers }: Response): boolean {
-  return (ok || status < 200) && headers.get("content-length") !== "0";
+  // A redirect is handed on only if it does not say where it leads.
+  if (status < 200 || (status >= 300 && status < 400)) return true;
+  return ok && headers.get("content-length") !== "0";
 }
 
 /** The error for an answer that was cut short. */
