@@ -85,9 +85,12 @@ def read_header(file: IO[bytes]) -> NpyHeader:
             header = NpyHeader(*_HEADER_READERS[version](head))
     except Exception as error:  # the header is a Python literal: numpy does not say what its parser may raise
         reason = str(error) or type(error).__name__
-        raise FormatError(f"expected an NPY header of version 1.0 or 2.0, got one not readable: {reason}") from None
+        raise FormatError(
+            f"this NPY array has no header of version 1.0 or 2.0 that can be read ({reason}): save it again with "
+            "numpy.save"
+        ) from None
     if any(length < 0 for length in header.shape):
-        raise FormatError(f"expected an NPY header with lengths of 0 or more, got shape {header.shape}")
+        raise FormatError(f"this NPY array has a negative length in its header, {header.shape}: save it again")
     file.seek(head.tell())
     return header
 
@@ -107,7 +110,10 @@ def read_values(file: IO[bytes], header: NpyHeader) -> NDArray[Any]:
     while done < len(rest):
         chunk = file.read(min(_CHUNK, len(rest) - done))
         if not chunk:
-            raise FormatError(f"expected {number(len(rest))} bytes of values ({header.words}), got {number(done)}")
+            raise FormatError(
+                f"this NPY array is cut short: its header says {header.words}, {number(len(rest))} bytes, and "
+                f"{number(done)} follow"
+            )
         rest[done : done + len(chunk)] = chunk
         done += len(chunk)
     return values.T if header.fortran else values
@@ -126,9 +132,10 @@ def read(source: Source) -> Surface:
         source.check_array(header.shape, header.dtype)
         follows = source.size - file.tell()
         if follows != header.nbytes:
-            words = "the file is cut short" if follows < header.nbytes else "something follows the array"
+            words = "is cut short" if follows < header.nbytes else "goes on behind its array"
             raise FormatError(
-                f"expected {number(header.nbytes)} bytes of values ({header.words}), got {number(follows)}: {words}"
+                f"this file {words}: its header says {header.words}, {number(header.nbytes)} bytes, and "
+                f"{number(follows)} follow; copy it or save it again"
             )
         if source.room.takes(header.nbytes) and not header.fortran:
             mapped = np.memmap(source.path, header.dtype, "r", file.tell(), header.shape)

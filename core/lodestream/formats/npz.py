@@ -84,7 +84,10 @@ def read(source: Source) -> Surface:
             warn(f"left out arrays of the archive: {listing(left_out)}")
     if axes[0] is not None and axes[1] is not None:
         if values.ndim != 2:
-            raise FormatError(f"expected heights of shape (H, W) for coordinates beside them, got shape {values.shape}")
+            raise FormatError(
+                f"this archive has x and y beside {name}, which must then be heights of shape (H, W), and has the "
+                f"shape {values.shape}: choose another array with array=, or save the points without x and y"
+            )
         return place(
             values, axes[0], axes[1], closed=source.closed, mask=mask, attributes=attributes, metadata=metadata
         )
@@ -117,7 +120,9 @@ class _Contents:
             read_header(file)
             values = read_values(file, header)
             if file.read(1):  # reading to the end is also what makes zipfile compare the CRC
-                raise FormatError(f"expected {number(header.nbytes)} bytes of values in {name}, got more")
+                raise FormatError(
+                    f"this archive is damaged: {name} goes on behind the {number(header.nbytes)} bytes of its values"
+                )
         return values
 
     def coordinate(self, letter: str, shape: tuple[int, ...], heights: str) -> Coordinate | None:
@@ -134,11 +139,12 @@ class _Contents:
         if letter in self.source.options:
             name = str(self.source.options[letter])
             if name not in self.headers:
-                raise OptionError(f"expected {letter}= one of {self.listing}, got {name!r}")
+                raise OptionError(f"this archive has no array {name!r} for {letter}=, only {self.listing}")
             header = self.headers[name]
             if header.shape not in shapes or header.dtype.kind not in "iuf":
                 raise FormatError(
-                    f"expected {name} of the shape of {heights}, {shape}, or a vector along it, got {header.words}"
+                    f"this archive has {header.words} in {name}, which is no {letter} of {heights}: save numbers of "
+                    f"its shape, {shape}, or a vector of {shape[1 - 'xy'.index(letter)]}"
                 )
         else:
             fitting = (
@@ -205,7 +211,9 @@ def _refusals() -> Iterator[None]:
     except InputError:
         raise
     except (BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError, OSError) as error:
-        raise FormatError(f"expected a whole NPZ archive, got one that cannot be unpacked: {error}") from None
+        raise FormatError(
+            f"this NPZ archive cannot be unpacked, since it is damaged or cut short ({error}): copy it or save it again"
+        ) from None
 
 
 def _members(archive: ZipFile) -> dict[str, ZipInfo]:
@@ -215,9 +223,15 @@ def _members(archive: ZipFile) -> dict[str, ZipInfo]:
     members = {}
     for info in infos:
         if not info.filename.endswith(".npy"):
-            raise FormatError(f"expected an NPZ archive, which holds .npy members only, got a member {info.filename!r}")
+            raise FormatError(
+                f"this is a ZIP archive that holds {info.filename!r}, not an archive of NumPy, which holds .npy files "
+                "only: unpack it, and give the file with the surface"
+            )
         if info.flag_bits & _ENCRYPTED or info.compress_type not in (ZIP_STORED, ZIP_DEFLATED):
-            raise FormatError(f"expected members stored or deflated, got {info.filename!r} packed in another way")
+            raise FormatError(
+                f"this archive has {info.filename!r} encrypted, or packed otherwise than stored or deflated: save it "
+                "with numpy.savez or numpy.savez_compressed"
+            )
         members[info.filename.removesuffix(".npy")] = info
     return members
 
@@ -228,8 +242,10 @@ def _header(archive: ZipFile, member: ZipInfo) -> NpyHeader:
         promised = file.tell() + header.nbytes
     if promised != member.file_size and not header.dtype.hasobject:
         kind = TooLargeError if promised > member.file_size else FormatError
+        words = "is cut short" if promised > member.file_size else "goes on behind its array"
         raise kind(
-            f"expected {number(promised)} bytes in {member.filename!r} ({header.words}), got {number(member.file_size)}"
+            f"this archive is damaged: {member.filename!r} {words}, with {number(member.file_size)} bytes where its "
+            f"header says {header.words}, {number(promised)} bytes"
         )
     return header
 
@@ -238,7 +254,7 @@ def _choose(contents: _Contents) -> str:
     if "array" in contents.source.options:
         name = str(contents.source.options["array"])
         if name not in contents.headers:
-            raise OptionError(f"expected array= one of {contents.listing}, got {name!r}")
+            raise OptionError(f"this archive has no array {name!r}: choose with array= one of {contents.listing}")
         return name
     beside = {*COORDINATES["x"], *COORDINATES["y"]}
     beside |= {str(contents.source.options[letter]) for letter in "xy" if letter in contents.source.options}
@@ -252,11 +268,15 @@ def _choose(contents: _Contents) -> str:
     if surfaces:
         names = " or ".join(surfaces)
         raise ChoiceError(
-            f"expected one array that is a surface, got {len(surfaces)}: choose one with array= {names}",
+            f"this archive has {len(surfaces)} arrays that are surfaces: choose one with array= {names}",
             [Choice({"array": name}, contents.headers[name].shape[:2]) for name in surfaces[:MOST_CHOICES]],
         )
+    if len(contents.headers) == 1:
+        ((name, header),) = contents.headers.items()
+        raise FormatError(f"{name}: {refuse_array(header.shape, header.dtype)}")
     raise FormatError(
-        f"expected an array of shape (H, W), (H, W, 2) or (H, W, C >= 3) of numbers, got {contents.listing}"
+        "this archive has no array of the shape (H, W), (H, W, 2), (H, W, 3) or more channels, of integers, float32 or "
+        f"float64: it holds {contents.listing}"
     )
 
 

@@ -179,14 +179,17 @@ class Source:
 
 def refuse_array(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str | None:
     """Return the reason why an array of this shape and type is no surface; None if it is one."""
-    if dtype.kind in _KINDS:
-        return f"expected integers or floating-point numbers, got {_KINDS[dtype.kind]} ({dtype})"
-    if dtype.kind == "f" and dtype.itemsize not in _FLOAT_SIZES:
-        return f"expected integers or float32 or float64, got {dtype}"
+    if dtype.kind in _KINDS or (dtype.kind == "f" and dtype.itemsize not in _FLOAT_SIZES):
+        kind = f"{_KINDS[dtype.kind]} ({dtype})" if dtype.kind in _KINDS else str(dtype)
+        return f"this is an array of {kind}: save it as integers, float32 or float64"
     if len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] < 2):
-        return f"expected an array of shape (H, W), (H, W, 2), (H, W, 3) or (H, W, C > 3), got shape {shape}"
+        advice = {1: "give it rows and columns", 3: "drop its last axis"}.get(len(shape), "save one slice of it")
+        return (
+            f"this is an array of shape {shape}, not of (H, W), heights in rows and columns, nor of (H, W, 2), "
+            f"(H, W, 3) or more channels, points: {advice}"
+        )
     if min(shape) < 1 or shape[0] * shape[1] < 2:
-        return f"expected a grid of at least two points, got shape {shape}"
+        return f"this is an array of shape {shape}: a surface has at least two points"
     return None
 
 

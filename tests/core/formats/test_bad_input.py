@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from lodestream import formats
 from lodestream.decoding.decoder import decode
 from lodestream.encoding.encode import encode
-from lodestream.errors import FormatError, InputError, OptionError, TooLargeError
+from lodestream.errors import ChoiceError, FormatError, InputError, OptionError, TooLargeError
 from lodestream.surface import Surface
 
 MIB = 1 << 20
@@ -68,8 +68,8 @@ def tiff(bands: Any, **profile: Any) -> bytes:
             return bytes(memory.read())
 
 
-#: What every refusal has: what it takes the file for, or what it expected and did not find.
-TOLD = re.compile("expected.* got|this is |cannot read", re.DOTALL)
+#: What every refusal has: what is wrong with the file, or what was expected and not found.
+TOLD = re.compile("expected.* got|this |cannot read", re.DOTALL)
 
 
 def refuse(path: Path, error: type[InputError], message: str, **options: Any) -> None:
@@ -122,9 +122,14 @@ REFUSALS: dict[str, tuple[str, Callable[[], bytes], type[InputError], str]] = {
         "a.npy",
         lambda: npy(np.zeros((9, 9)))[:-1],
         FormatError,
-        r"648 bytes of values .*, got 647: .*cut",
+        "this file is cut short: its header says 9 x 9 float64, 648 bytes, and 647 follow; copy it",
     ),
-    "NPY and more": ("a.npy", lambda: npy(np.zeros((9, 9))) + b"x", FormatError, r"648 bytes of values .*, got 649"),
+    "NPY and more": (
+        "a.npy",
+        lambda: npy(np.zeros((9, 9))) + b"x",
+        FormatError,
+        "behind its array: .* 648 bytes, and 649",
+    ),
     "terabytes": (
         "a.npy",
         lambda: npy_header("(1000000, 1000000)"),
@@ -132,42 +137,82 @@ REFUSALS: dict[str, tuple[str, Callable[[], bytes], type[InputError], str]] = {
         "at most .* vertices, got an array",
     ),
     "terabytes of channels": ("a.npy", lambda: npy_header("(2, 2, 1000000000000)"), TooLargeError, "at most 64 values"),
-    "gigabytes": ("a.npy", lambda: npy_header("(10000, 10000)"), FormatError, "800,000,000 bytes of values .*, got 0"),
-    "negative lengths": ("a.npy", lambda: npy_header("(-1, -5)"), FormatError, r"lengths of 0 or more, got shape"),
-    "no lengths": ("a.npy", lambda: npy_header("None"), FormatError, "an NPY header of version"),
+    "gigabytes": (
+        "a.npy",
+        lambda: npy_header("(10000, 10000)"),
+        FormatError,
+        "cut short: .*800,000,000 bytes, and 0 follow",
+    ),
+    "negative lengths": (
+        "a.npy",
+        lambda: npy_header("(-1, -5)"),
+        FormatError,
+        r"a negative length in its header, \(-1, -5\): save",
+    ),
+    "no lengths": (
+        "a.npy",
+        lambda: npy_header("None"),
+        FormatError,
+        "no header of version 1.0 or 2.0 .*: save it again",
+    ),
     "header of code": (
         "a.npy",
         lambda: npy_header("__import__('os').getcwd()"),
         FormatError,
-        "an NPY header of version",
+        "no header of version 1.0 or 2.0 .*: save it again",
     ),
-    "deep header": ("a.npy", lambda: npy_header("(" * 5000), FormatError, "an NPY header of version"),
-    "long header": ("a.npy", lambda: npy_header("(2, 2)" + " " * 20000, major=2), FormatError, "an NPY header"),
-    "half a header": ("a.npy", lambda: npy(np.eye(3))[:20], FormatError, "an NPY header of version 1.0 or 2.0, got"),
-    "NPY of the future": ("a.npy", lambda: b"\x93NUMPY\x09\0" + bytes(90), FormatError, "got .*version 9.0"),
-    "objects": ("a.npy", lambda: npy(np.full((2, 2), {}, object)), FormatError, "got Python objects, which are never"),
-    "strings": ("a.npy", lambda: npy([["a", "b"], ["c", "d"]]), FormatError, r"numbers, got strings \(<U1\)"),
-    "byte strings": ("a.npy", lambda: npy([[b"a", b"b"]]), FormatError, r"numbers, got byte strings \(\|S1\)"),
-    "complex numbers": ("a.npy", lambda: npy([[1j, 2], [3, 4]]), FormatError, "got complex numbers"),
-    "booleans": ("a.npy", lambda: npy(np.eye(2, dtype=bool)), FormatError, "got booleans"),
-    "records": ("a.npy", lambda: npy(np.zeros((2, 2), "f4,i4")), FormatError, "got records"),
-    "dates": ("a.npy", lambda: npy(np.zeros((2, 2), "M8[s]")), FormatError, "got dates"),
-    "half floats": ("a.npy", lambda: npy(np.zeros((2, 2), "f2")), FormatError, "float32 or float64, got float16"),
-    "a vector": ("a.npy", lambda: npy(np.zeros(7)), FormatError, r"an array of shape .* got shape \(7,\)"),
+    "deep header": (
+        "a.npy",
+        lambda: npy_header("(" * 5000),
+        FormatError,
+        "no header of version 1.0 or 2.0 .*: save it again",
+    ),
+    "long header": ("a.npy", lambda: npy_header("(2, 2)" + " " * 20000, major=2), FormatError, "no header of version"),
+    "half a header": (
+        "a.npy",
+        lambda: npy(np.eye(3))[:20],
+        FormatError,
+        "no header of version 1.0 or 2.0 that can be read",
+    ),
+    "NPY of the future": ("a.npy", lambda: b"\x93NUMPY\x09\0" + bytes(90), FormatError, r"read \(version 9.0\): save"),
+    "objects": (
+        "a.npy",
+        lambda: npy(np.full((2, 2), {}, object)),
+        FormatError,
+        "of Python objects, which are never .*: save it as",
+    ),
+    "strings": (
+        "a.npy",
+        lambda: npy([["a", "b"], ["c", "d"]]),
+        FormatError,
+        r"of strings \(<U1\): save it as integers, float32 or",
+    ),
+    "byte strings": ("a.npy", lambda: npy([[b"a", b"b"]]), FormatError, r"of byte strings \(\|S1\): save"),
+    "complex numbers": ("a.npy", lambda: npy([[1j, 2], [3, 4]]), FormatError, "an array of complex numbers"),
+    "booleans": ("a.npy", lambda: npy(np.eye(2, dtype=bool)), FormatError, "an array of booleans"),
+    "records": ("a.npy", lambda: npy(np.zeros((2, 2), "f4,i4")), FormatError, "an array of records"),
+    "dates": ("a.npy", lambda: npy(np.zeros((2, 2), "M8[s]")), FormatError, "an array of dates"),
+    "half floats": (
+        "a.npy",
+        lambda: npy(np.zeros((2, 2), "f2")),
+        FormatError,
+        "of float16: save it as .* float32 or float64",
+    ),
+    "a vector": ("a.npy", lambda: npy(np.zeros(7)), FormatError, r"an array of shape \(7,\), .*: give it rows and"),
     "a volume": (
         "a.npy",
         lambda: npy(np.zeros((2, 2, 2, 2))),
         FormatError,
-        r"an array of shape .* got shape \(2, 2, 2",
+        r"an array of shape \(2, 2, 2, 2\), .*: save one slice of it",
     ),
     "one channel": (
         "a.npy",
         lambda: npy(np.zeros((2, 2, 1))),
         FormatError,
-        r"an array of shape .* got shape \(2, 2, 1",
+        r"an array of shape \(2, 2, 1\), .*: drop its last axis",
     ),
-    "one point": ("a.npy", lambda: npy([[1.0]]), FormatError, r"at least two points, got shape \(1, 1\)"),
-    "no points": ("a.npy", lambda: npy(np.zeros((0, 5))), FormatError, r"at least two points, got shape \(0, 5\)"),
+    "one point": ("a.npy", lambda: npy([[1.0]]), FormatError, r"of shape \(1, 1\): .* at least two points"),
+    "no points": ("a.npy", lambda: npy(np.zeros((0, 5))), FormatError, r"of shape \(0, 5\): .* at least two points"),
     "all NaN": (
         "a.npy",
         lambda: npy(np.full((3, 3), np.nan)),
@@ -175,20 +220,42 @@ REFUSALS: dict[str, tuple[str, Callable[[], bytes], type[InputError], str]] = {
         "at least one valid point, got 3 x 3 holes",
     ),
     # NPZ
-    "empty archive": ("a.npz", lambda: npz({}), FormatError, "an array of shape .* of numbers, got nothing"),
+    "empty archive": ("a.npz", lambda: npz({}), FormatError, "no array of the shape .*: it holds nothing"),
     "truncated archive": (
         "a.npz",
         lambda: npz({"a.npy": npy(np.eye(9))})[:-9],
         FormatError,
-        "a whole NPZ archive, got",
+        "cannot be unpacked, .* damaged or cut short .*: copy it or save it again",
     ),
-    "another archive": ("a.npz", lambda: npz({"a.txt": b"hello"}), FormatError, "which holds .npy members only, got"),
-    "no surface": ("a.npz", lambda: npz({"a.npy": npy([1.0, 2.0])}), FormatError, r"got a \(2 float64\)"),
+    "another archive": (
+        "a.npz",
+        lambda: npz({"a.txt": b"hello"}),
+        FormatError,
+        "holds 'a.txt', not an archive of NumPy.*: unpack it",
+    ),
+    "no surface": (
+        "a.npz",
+        lambda: npz({"a.npy": npy([1.0, 2.0])}),
+        FormatError,
+        r"a: this is an array of shape \(2,\)",
+    ),
     "objects in an archive": (
         "a.npz",
         lambda: npz({"a.npy": npy(np.full(2, {}, object))}),
         FormatError,
-        "got a .2 obj",
+        "a: this is an array of Python objects, which are never",
+    ),
+    "no surface among several": (
+        "a.npz",
+        lambda: npz({"a.npy": npy([1.0, 2.0]), "b.npy": npy([[True]])}),
+        FormatError,
+        r"no array of the shape .*: it holds a \(2 float64\), b \(1 x 1 bool\)",
+    ),
+    "several surfaces": (
+        "a.npz",
+        lambda: npz({"a.npy": npy(np.eye(2)), "b.npy": npy(np.eye(2))}),
+        ChoiceError,
+        "has 2 arrays that are surfaces: choose one with array= a or b",
     ),
     "many members": (
         "a.npz",
@@ -200,21 +267,21 @@ REFUSALS: dict[str, tuple[str, Callable[[], bytes], type[InputError], str]] = {
         "a.npz",
         lambda: npz({"a.npy": npy(np.eye(3))}, zipfile.ZIP_LZMA),
         FormatError,
-        "members stored or deflated, got 'a.npy'",
+        "'a.npy' encrypted, or packed otherwise .* numpy.savez_compressed",
     ),
     "member cut short": (
         "a.npz",
         lambda: npz({"a.npy": npy(np.eye(9))[:-8]}),
         TooLargeError,
-        "bytes in 'a.npy' .* got",
+        "damaged: 'a.npy' is cut short, with .* bytes where .* 9 x 9 float64, ",
     ),
-    "member too long": ("a.npz", lambda: npz({"a.npy": npy(np.eye(9)) + b"x"}), FormatError, "bytes in 'a.npy' .* got"),
+    "member too long": ("a.npz", lambda: npz({"a.npy": npy(np.eye(9)) + b"x"}), FormatError, "'a.npy' goes on behind"),
     "bomb": ("a.npz", lambda: npz({"a.npy": npy(np.zeros((2048, 2048)))}), TooLargeError, "at most 1,000,000 vertices"),
     "bomb of a header": (
         "a.npz",
         lambda: npz({"a.npy": npy_header("(2, 2)" + " " * 32 * MIB, major=2)}),
         FormatError,
-        "an NPY header of version",
+        "no header of version 1.0 or 2.0 .*: save it again",
     ),
     "lying directory": (
         "a.npz",

@@ -94,7 +94,7 @@ def bomb() -> bytes:
         (npy(np.full((4, 4), np.nan)), "one valid point"),
         (npy(np.array([["a", "b"], ["c", "d"]])), "strings"),
         (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "line 4"),
-        (bomb(), "expected"),
+        (bomb(), "goes on behind its array"),
     ],
 )
 def test_what_only_a_reader_sees_ends_as_failed_without_its_bytes(
