@@ -47,8 +47,8 @@ def read(source: Source) -> Surface:
     check_faces(source, faces)
     if _LEAST_BYTES * (vertices + faces) > source.size:
         raise FormatError(
-            f"expected at least {number(_LEAST_BYTES * (vertices + faces))} bytes for {number(vertices)} vertices and "
-            f"{number(faces)} faces, got {number(source.size)}"
+            f"this OFF is cut short: it says {number(vertices)} vertices and {number(faces)} faces, at least "
+            f"{number(_LEAST_BYTES * (vertices + faces))} bytes, and has {number(source.size)}"
         )
     points, attributes = lines.vertices(vertices)
     counts, values, coloured = lines.faces(faces, vertices, polygons_allowed(source.options))
@@ -103,7 +103,9 @@ class _Lines:
     def _take(self, count: int, what: str) -> tuple[list[list[bytes]], list[int]]:
         rows = self._rows[self._place : self._place + count]
         if len(rows) < count:
-            raise FormatError(f"expected {number(count)} lines of {what}, got {number(len(rows))}")
+            raise FormatError(
+                f"this OFF is cut short: it says {number(count)} {what}, and {number(len(rows))} lines of them follow"
+            )
         numbers = self.numbers[self._place : self._place + count]
         self._place += count
         return rows, numbers

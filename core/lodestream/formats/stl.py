@@ -43,14 +43,15 @@ def read(source: Source) -> Surface:
             check_faces(source, promised)
         elif _TEXT.match(head + file.read(_TEXT_HEAD)) is None:
             raise FormatError(
-                f"expected text that begins with a solid, or {number(_HEAD + _TRIANGLE * promised)} bytes for "
-                f"{number(promised)} triangles, got {number(source.size)}"
+                f"this STL is cut short or damaged: it is no text that begins with a solid, and its "
+                f"{number(source.size)} bytes are not the {number(_HEAD + _TRIANGLE * promised)} of the "
+                f"{number(promised)} triangles that it says"
             )
         file.seek(0)
         parts = [mesh for mesh, _ in parts_of(file, "stl")]
     corners = np.concatenate([np.empty((0, 3)), *(mesh.triangles.reshape(-1, 3) for mesh in parts)])
     if not len(corners):
-        raise FormatError("expected triangles, got none")
+        raise FormatError("this STL has no triangles")
     check_faces(source, len(corners) // 3)
     places, vertex = equal_places(corners)
     source.check_vertices(len(places), f"{number(len(places))} vertices")

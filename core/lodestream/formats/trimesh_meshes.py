@@ -52,7 +52,8 @@ def parts_of(file: BinaryIO, kind: str) -> list[tuple[trimesh.Trimesh, NDArray[n
     except Exception as error:  # it raises whatever comes up in the code that meets what is wrong
         words = " ".join(str(error).split())[:200]
         raise FormatError(
-            f"expected {kind.upper()} that trimesh reads, got one where it says {type(error).__name__}: {words}"
+            f"trimesh cannot read this {kind.upper()}, which may be damaged or cut short: {type(error).__name__}: "
+            f"{words}"
         ) from None
     parts = [(scene.geometry[name], np.asarray(matrix, np.float64)) for matrix, name in placed]
     return [(mesh, matrix) for mesh, matrix in parts if isinstance(mesh, trimesh.Trimesh)]

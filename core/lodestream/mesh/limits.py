@@ -35,7 +35,7 @@ def check_pieces(count: int, faces: int, most_small: int = SMALL_PIECES, between
     most = most_blocks(faces)
     if count > most or (count > most_small and faces < LEAST_QUADS * count):
         raise FormatError(
-            f"expected at most {most:,} connected pieces, and of more than {most_small} pieces {LEAST_QUADS} faces in "
-            f"each on average, got {count:,} pieces of {faces:,} faces in all{between}: weld vertices at the same "
-            f"place first"
+            f"this mesh falls into {count:,} connected pieces, of {faces:,} faces in all{between}, and may have "
+            f"{most:,}, with {LEAST_QUADS} faces in each on average if they are more than {most_small}: weld vertices "
+            "at the same place first"
         )

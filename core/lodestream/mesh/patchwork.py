@@ -126,7 +126,7 @@ def _poles_and_pairs(
     pole, misfits = find_fans(corners, umbrella, valence, mixed)
     if misfits.size:
         raise FormatError(
-            f"expected quads, or triangles only in fans round a vertex (a pole), got triangles elsewhere: "
+            f"this mesh has triangles beside quads, where only fans round a vertex (a pole) may be triangles: "
             f"{name_faces(mesh, polygons.origin[misfits])}; make quads of them, or all faces triangles"
         )
     with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one
@@ -236,16 +236,17 @@ def _unpaired(
     faces, corner = np.nonzero(wrong)
     if not faces.size:
         return (
-            f"expected triangles that are the halves of a grid's quads, got a border along which some have no "
-            f"partner: {name_faces(mesh, polygons.origin[unpaired])}"
+            f"this mesh of triangles is no grid whose quads are cut in two: along a border some are no half of a quad: "
+            f"{name_faces(mesh, polygons.origin[unpaired])}"
         )
     face, k = unpaired[faces[0]], corner[0]
     count = int(valence[rows[faces[0], k]])
     irregular = len(np.unique(rows[wrong]))
     return (
-        f"expected six triangles round every inner vertex (the cells of a grid cut in two), or fans round poles, got "
-        f"{count} round vertex {int(polygons.corners[face, k]) + 1} of {name_faces(mesh, polygons.origin[[face]])}, "
-        f"and another number than six round {irregular:,} vertices in all: make quads of the triangles first"
+        f"this mesh of triangles is no grid whose quads are cut in two, with six round every inner vertex, or fans "
+        f"round poles: {count} are round vertex {int(polygons.corners[face, k]) + 1} of "
+        f"{name_faces(mesh, polygons.origin[[face]])}, and another number than six round {irregular:,} vertices in "
+        "all; make quads of the triangles first"
     )
 
 

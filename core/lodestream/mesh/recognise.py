@@ -109,7 +109,7 @@ def recognise(mesh: Mesh) -> Recognised:
         When there are no such grids, naming the first faces that do not fit and what to do about them.
     """
     if not len(mesh.corners):
-        raise FormatError("expected faces, got none")
+        raise FormatError("this mesh has no faces: save it with them, since points alone are no grid")
     shared, seams, left_out = sort_attributes(mesh)
     while True:
         attributes = (

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from .refusals import SECONDS, Refusal, refusals
-from .test_bad_input import MIB
+from .test_bad_input import MIB, TOLD
 from .test_plot3d import Written
 
 VTS = (
@@ -128,14 +128,14 @@ CASES: dict[str, tuple[str, Callable[[], bytes], dict[str, Any], str, str]] = {
         lambda: PCD.format(9999, 9999, 9999**2, "binary").encode() + bytes(99),
         {},
         "FormatError",
-        "got 99: the file is cut short",
+        "cut short: .* and 99 follow",
     ),
     "PCD of lines that are not there": (
         "a.pcd",
         lambda: PCD.format(9999, 9999, 9999**2, "ascii").encode() + b"1 2 3\n",
         {},
         "FormatError",
-        "expected 99,980,001 lines of points, got 1",
+        "cut short: its header says 99,980,001 points, and 1 lines follow",
     ),
     "PCD of a million-fold archive": (
         "a.pcd",
@@ -171,14 +171,14 @@ CASES: dict[str, tuple[str, Callable[[], bytes], dict[str, Any], str, str]] = {
         lambda: PLY.format("ascii", 2**31, RANGE.format(9, 9, 81, "uchar")).encode() + b"1 2 3\n",
         {},
         "FormatError",
-        "bytes after the header for 2,147,483,648 rows of vertex",
+        "cut short: its header says 2,147,483,648 rows of vertex",
     ),
     "PLY of 2^31 vertices": (
         "a.ply",
         lambda: PLY.format("binary_little_endian", 2**31, RANGE.format(9, 9, 81, "uchar")).encode() + bytes(999),
         {},
         "FormatError",
-        "bytes after the header for 2,147,483,648 rows of vertex",
+        "cut short: its header says 2,147,483,648 rows of vertex",
     ),
     "PLY of a range grid of 2^62 places": (
         "a.ply",
@@ -192,7 +192,7 @@ CASES: dict[str, tuple[str, Callable[[], bytes], dict[str, Any], str, str]] = {
         lambda: PLY.format("binary_little_endian", 1, RANGE.format(3, 3, 9, "uint")).encode() + b"\xff" * 99,
         {},
         "FormatError",
-        "cut short at row 0",
+        "cut short: its header says 9 rows of range_grid, and at row 0 ",
     ),
     "PLY whose header never ends": ("a.ply", lambda: b"ply\n" + b"comment a\n" * 300000, {}, "FormatError", "end_head"),
     "VTS whose array lies about its length": (
@@ -271,7 +271,13 @@ CASES: dict[str, tuple[str, Callable[[], bytes], dict[str, Any], str, str]] = {
         "expected structured grids that VTK reads",
     ),
     "GLB": ("a.glb", lambda: b"glTF\2\0\0\0" + bytes(99), {}, "FormatError", "expected glTF 2 of 0 bytes, as it says"),
-    "STL": ("a.stl", lambda: bytes(80) + b"\xff" * 99, {}, "FormatError", "bytes for 4,294,967,295 triangles, got 179"),
+    "STL": (
+        "a.stl",
+        lambda: bytes(80) + b"\xff" * 99,
+        {},
+        "FormatError",
+        "179 bytes are not the .* of the 4,294,967,295 triangles",
+    ),
 }
 
 
@@ -295,5 +301,5 @@ def test_hostile_files_are_refused_in_time_and_space(refused: dict[str, Refusal]
     assert re.search(message, found.message), found
     assert found.memory < 512 * MIB
     assert found.seconds < SECONDS
-    assert "expected" in found.message
+    assert TOLD.search(found.message)
     assert "\n" not in found.message

@@ -108,9 +108,13 @@ def test_an_element_may_have_no_property(tmp_path: Path, order: str, rows: int) 
         (HEADER.replace("float x", "quad x"), "", "line 4: expected a line of a PLY 1.0 header, got 'property quad x'"),
         (HEADER.replace("uchar c", "uchar x"), "", "line 5: expected properties of different names, got 'x' twice"),
         (HEADER.replace("list uchar", "list float"), "", "line 7: expected a list whose length is an integer"),
-        (HEADER.replace("vertex 2", "vertex 2147483648"), "1 2\n", "at least 8,589,934,592 bytes after the header"),
+        (
+            HEADER.replace("vertex 2", "vertex 2147483648"),
+            "1 2\n",
+            "for which at least 8,589,934,592 bytes follow it, and 4 do",
+        ),
         (HEADER.replace("face", "vertex"), "1 2\n3 4\n0\n", "elements of different names"),
-        (HEADER, "1 2\n3 4\n", "expected at least 10 bytes after the header for 1 rows of face, got 8"),
+        (HEADER, "1 2\n3 4\n", "1 rows of face, for which at least 10 bytes follow it, and 8 do"),
         (HEADER, "1 2\n3\n1 77777\n", "line 10: expected 2 numbers of vertex, got '3'"),
         (HEADER, "1 2\n3 x\n0\n", "line 10: expected numbers of vertex, got '3 x'"),
         (HEADER, "1 2\n3 256\n0\n", "line 10: expected an integer from 0 to 255 (c) of vertex"),
@@ -140,9 +144,9 @@ ROWS = np.array([(1.5, 2), (3.5, 4)], [("x", "<f4"), ("c", "u1")]).tobytes()
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        (ROWS + b"\x02" + bytes(4), "1 rows of face, got a file that is cut short at row 0 by 4 bytes"),
+        (ROWS + b"\x02" + bytes(4), "1 rows of face, and at row 0 4 bytes are missing"),
         (ROWS + b"\x00\x00", "the end of the file after its elements, got 1 bytes more"),
-        (ROWS[:-4], "expected at least 10 bytes after the header for 2 rows of vertex, got 6"),
+        (ROWS[:-4], "2 rows of vertex, for which at least 10 bytes follow it, and 6 do"),
     ],
 )
 def test_a_bad_binary_file_is_refused(tmp_path: Path, rows: bytes, message: str) -> None:

@@ -80,13 +80,19 @@ def test_colours_are_left_out_with_a_note(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (binary(grid())[:-1], "expected text that begins with a solid, or 2,484 bytes for 48 triangles, got 2,483"),
-        (b"\0" * 80 + b"\xff" * 4, "or 214,748,364,834 bytes for 4,294,967,295 triangles, got 84"),
-        (b"\0" * 84, "expected triangles, got none"),
-        (b"solid a\nendsolid a\n", "expected triangles, got none"),
-        (text(grid()).replace(b"vertex 1.0", b"vertex one"), "expected STL that trimesh reads"),
-        (text(grid())[:300], "expected triangles, got none"),
-        (b"solid", "expected text that begins with a solid"),
+        (
+            binary(grid())[:-1],
+            "cut short or damaged: .* 2,483 bytes are not the 2,484 of the 48 triangles",
+        ),
+        (b"\0" * 80 + b"\xff" * 4, "84 bytes are not the 214,748,364,834 of the 4,294,967,295 triangles"),
+        (b"\0" * 84, "this STL has no triangles"),
+        (b"solid a\nendsolid a\n", "this STL has no triangles"),
+        (
+            text(grid()).replace(b"vertex 1.0", b"vertex one"),
+            "trimesh cannot read this STL, which may be damaged or cut",
+        ),
+        (text(grid())[:300], "this STL has no triangles"),
+        (b"solid", "is no text that begins with a solid"),
     ],
 )
 def test_what_is_no_stl_is_refused(content: bytes, words: str, tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def twisted_rings() -> NDArray[np.int64]:
 CASES = {
     "soup": (soup, "pieces of 30,000 faces"),
     "stairs": (stairs, "irregular vertices"),
-    "many fans": (many_fans, "six triangles round every inner vertex"),
+    "many fans": (many_fans, "with six round every inner vertex"),
     "tangle": (tangle, "each edge to join at most two faces"),
     "random faces": (random_faces, "blocks|pieces|two sides|two faces"),
     "twisted rings": (twisted_rings, "connected pieces"),

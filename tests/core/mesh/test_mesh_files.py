@@ -174,7 +174,7 @@ def test_ply_curve(tmp_path: Path) -> None:
         (
             "element face 6",
             "element tristrips 6",
-            r"expected a PLY file with .* or face, got elements vertex, tristrips",
+            r"this PLY has no faces, only vertex, tristrips, .*: save it with an element face",
         ),
     ],
 )
@@ -227,7 +227,7 @@ def test_off_colours(tmp_path: Path) -> None:
         ("4OFF\n12 6 0\n", "expected OFF of three dimensions, got 4OFF"),
         ("OFF\n12\n", r"line 2: expected the numbers of vertices, faces and edges, got '12'"),
         ("OFF\n", "expected the numbers of vertices, faces and edges, got ''"),
-        ("OFF\n99999999 1 0\n", r"expected at least .* bytes for 99,999,999 vertices and 1 faces, got 17"),
+        ("OFF\n99999999 1 0\n", r"cut short: it says 99,999,999 vertices and 1 faces, .* and has 17"),
         ("OFF\n2 1 0\n0 0 0\n1 0\n3 0 1 1\n", r"line 4: expected a vertex of 3 numbers, got '1 0'"),
         ("OFF\n2 1 0\n0 0 0\n1 0 x\n3 0 1 1\n", r"line 4: expected a vertex of 3 numbers, got '1 0 x'"),
         (
@@ -235,7 +235,7 @@ def test_off_colours(tmp_path: Path) -> None:
             r"line 5: expected 3 or 4 and as many vertices from 0 to 1, got '3 0 1 2'",
         ),
         ("OFF\n2 1 0\n0 0 0\n1 0 0\n5 0 1 0 1 0\n", r"expected faces of 3 or 4 corners, got 5 in line 5; remesh=yes"),
-        ("OFF\n2 2 0\n0 0 0\n1 0 0\n3 0 1 1\n", r"expected 2 lines of faces, got 1"),
+        ("OFF\n2 2 0\n0 0 0\n1 0 0\n3 0 1 1\n", r"cut short: it says 2 faces, and 1 lines of them follow"),
         ("OFF\n2 1 0\n0 0 0\n1 0 0\n3 0 1 1\n7\n", r"line 6: expected the end of the file after its faces, got '7'"),
         ("#\rXYZ\nOFF\n1 1 0\n0 0 0\n3 0 0 0\n", "expected a line with OFF at the beginning, got another"),
         ("COFF\n1 1 0\n0 0 0 1 1\n3 0 0 0\n", r"line 3: expected a vertex with a colour of 3 or 4 numbers"),

@@ -221,12 +221,12 @@ def test_surfaces_of_one_side_are_refused(rows: int) -> None:
         ),
         ([[0, 1, 0, 2]], r"name each vertex once .* got face 1: remove"),
         ([[0, 0, 1]], r"name each vertex once .* got face 1: remove"),
-        ([[0, 1, 2, 3], [2, 1, 4], [2, 4, 5]], r"triangles only in fans .* elsewhere: face 3; make quads of them"),
+        ([[0, 1, 2, 3], [2, 1, 4], [2, 4, 5]], r"triangles beside quads, .*: face 3; make quads of them"),
         (
             [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1], [1, 2, 5]],
-            r"got 4 round vertex 1 of face 1, .* round 1 vertices",
+            r"round poles: 4 are round vertex 1 of face 1, .* round 1 vertices",
         ),
-        ([], "expected faces, got none"),
+        ([], "this mesh has no faces: save it with them"),
     ],
 )
 def test_meshes_that_are_no_grid_are_refused_with_a_reason(faces: list[list[int]], message: str) -> None:
@@ -236,7 +236,7 @@ def test_meshes_that_are_no_grid_are_refused_with_a_reason(faces: list[list[int]
 
 def test_a_soup_of_quads_is_refused() -> None:
     faces = [[4 * k, 4 * k + 1, 4 * k + 2, 4 * k + 3] for k in range(100)]
-    with pytest.raises(FormatError, match=r"got 100 pieces of 100 faces in all: weld vertices"):
+    with pytest.raises(FormatError, match=r"into 100 connected pieces, of 100 faces in all, .*: weld vertices"):
         surface_of(mesh_of(faces, 400))
 
 

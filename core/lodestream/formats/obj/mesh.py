@@ -267,7 +267,7 @@ class ObjFile:
             If there is none.
         """
         if not self._values[b"v"]:
-            raise FormatError("expected points (v x y z), got none")
+            raise FormatError("this OBJ has no points (v x y z)")
         points = np.concatenate(self._values[b"v"])
         if points.shape[1] == 3:
             return points, {}

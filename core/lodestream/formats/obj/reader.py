@@ -43,7 +43,10 @@ def read(source: Source) -> Surface:
         return surface_of(source, file.mesh(), "obj", file.words)
     points, attributes = file.points()
     if not file.segments:
-        raise FormatError(f"expected faces that join points to a grid, got {number(len(points))} points and no face")
+        raise FormatError(
+            f"this OBJ has {number(len(points))} points and no faces, so that nothing joins the points to a grid: save "
+            "it with its faces"
+        )
     closed = find_curve(len(points), np.array(file.segments, np.int64), file.segment_lines)
     for text in file.notes():
         warn(text)

@@ -69,7 +69,8 @@ def read(source: Source) -> Surface:
         header = _read_header(file.read(_HEAD))
     if header.rows < 2:
         raise FormatError(
-            f"expected an organised cloud, whose HEIGHT is 2 or more, got HEIGHT {header.rows}: points without a grid"
+            f"this cloud has HEIGHT {header.rows}, so that nothing says which of its {number(header.points)} points "
+            "are neighbours: save it organised in rows and columns, with HEIGHT 2 or more, or make a mesh of it"
         )
     source.check_vertices(header.points, f"a cloud of {header.columns} x {header.rows}")
     if not _at_origin(header.viewpoint):
@@ -96,23 +97,29 @@ def _read_header(head: bytes) -> _Header:
     while "DATA" not in entries:
         end = head.find(b"\n", place)
         if end < 0:
-            raise FormatError(f"expected a PCD header that ends with DATA within {number(_HEAD)} bytes, got none")
+            raise FormatError(
+                f"this PCD header has no line DATA within {number(_HEAD)} bytes: the file is cut short, or damaged"
+            )
         words = head[place:end].decode("ascii", "replace").split("#", 1)[0].split()
         place, line = end + 1, line + 1
         if words:
             if words[0] not in _KEYS:
-                raise FormatError(f"line {line}: expected a PCD header of {', '.join(_KEYS)}, got {words[0][:40]!r}")
+                raise FormatError(
+                    f"line {line}: this PCD header has {words[0][:40]!r}, and may have {', '.join(_KEYS)} only"
+                )
             entries[words[0]] = words[1:]
     missing = [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT") if key not in entries]
     if missing:
-        raise FormatError(f"expected a PCD header with {', '.join(missing)}, got none")
+        raise FormatError(f"this PCD header has no line {' and no line '.join(missing)}: save the cloud again")
     width, height = (_integer(entries, key) for key in ("WIDTH", "HEIGHT"))
     if "POINTS" in entries and _integer(entries, "POINTS") != width * height:
         points = _integer(entries, "POINTS")
-        raise FormatError(f"expected POINTS to be WIDTH x HEIGHT ({width} x {height}), got {number(points)}")
+        raise FormatError(
+            f"this PCD header contradicts itself: POINTS is {number(points)}, and WIDTH x HEIGHT is {width} x {height}"
+        )
     data = " ".join(entries["DATA"])
     if data not in _READERS:
-        raise FormatError(f"expected DATA {', '.join(_READERS)}, got {data[:40]!r}")
+        raise FormatError(f"this PCD header has DATA {data[:40]!r}: save the cloud as {' or '.join(_READERS)}")
     return _Header(_record(entries), height, width, data, place, line, tuple(entries.get("VIEWPOINT", _ORIGIN)))
 
 
@@ -143,8 +150,15 @@ def _record(entries: dict[str, list[str]]) -> np.dtype[Any]:
     record = np.dtype(fields)
     assert record.fields is not None  # it was just made of fields
     axes = {record.fields[axis][0] for axis in "xyz" if axis in record.fields}
-    if not {"x", "y", "z"} <= record.fields.keys() or len(axes) != 1 or axes.pop().kind != "f":
-        raise FormatError(f"expected FIELDS x, y and z of one type F in the PCD header, got {' '.join(names)[:80]}")
+    if lacking := [axis for axis in "xyz" if axis not in record.fields]:
+        raise FormatError(
+            f"this cloud has no field {' and no field '.join(lacking)}, only {' '.join(names)[:80]}: save it with x, y "
+            "and z"
+        )
+    if len(axes) != 1 or axes.pop().kind != "f":
+        raise FormatError(
+            "this cloud has x, y and z of unlike or whole numbers: save all three with TYPE F and one SIZE"
+        )
     return record
 
 
@@ -155,7 +169,10 @@ def _read_text(source: Source, header: _Header) -> dict[str, NDArray[Any]]:
     while rows and not rows[-1]:
         rows.pop()
     if len(rows) != header.points:
-        raise FormatError(f"expected {number(header.points)} lines of points, got {number(len(rows))}")
+        words = "is cut short" if len(rows) < header.points else "goes on behind its points"
+        raise FormatError(
+            f"this cloud {words}: its header says {number(header.points)} points, and {number(len(rows))} lines follow"
+        )
     names = header.record.names or ()
     width = sum(header.record[name].shape[0] if header.record[name].shape else 1 for name in names)
     columns: dict[str, NDArray[Any]] = {}
@@ -199,8 +216,11 @@ def _read_binary(source: Source, header: _Header) -> dict[str, NDArray[Any]]:
     promised = header.points * header.record.itemsize
     follows = source.size - header.end
     if follows != promised:
-        words = "the file is cut short" if follows < promised else "something follows the points"
-        raise FormatError(f"expected {number(promised)} bytes of points, got {number(follows)}: {words}")
+        words = "is cut short" if follows < promised else "goes on behind its points"
+        raise FormatError(
+            f"this cloud {words}: its header says {number(header.points)} points, {number(promised)} bytes, and "
+            f"{number(follows)} follow"
+        )
     rows = np.memmap(source.path, header.record, "r", header.end, (header.points,))
     return _unpadded({name: np.array(rows[name]) for name in header.record.names or ()})
 
@@ -219,10 +239,13 @@ def _read_compressed(source: Source, header: _Header) -> dict[str, NDArray[Any]]
         head = file.read(8)
         sizes = struct.unpack("<II", head) if len(head) == 8 else ()
         follows = source.size - file.tell()
-        if len(sizes) != 2 or sizes[0] > follows or sizes[1] != promised:
+        if len(sizes) != 2 or sizes[0] > follows:
+            words = f"{number(sizes[0])} bytes of compressed points" if sizes else "two sizes of compressed points"
+            raise FormatError(f"this cloud is cut short: {words} should follow, and {number(follows)} bytes do")
+        if sizes[1] != promised:
             raise FormatError(
-                f"expected compressed points of at most {number(follows)} bytes that make {number(promised)}, got ones "
-                f"that say {' and '.join(map(number, sizes)) or 'nothing'}"
+                f"this cloud contradicts itself: its header says {number(header.points)} points, {number(promised)} "
+                f"bytes, and its compressed points make {number(sizes[1])}"
             )
         content = file.read(sizes[0])
     values = decompress(content, promised)

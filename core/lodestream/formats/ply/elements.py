@@ -87,7 +87,10 @@ class _Words:
         element = self._element
         if self._start + element.rows > len(self._rows):
             got = len(self._rows) - self._start
-            raise FormatError(f"expected {number(element.rows)} lines of {element.name}, got {number(got)}")
+            raise FormatError(
+                f"this PLY is cut short: its header says {number(element.rows)} lines of {element.name}, and "
+                f"{number(got)} follow"
+            )
         if not any(it.count for it in element.properties):
             return self._plain()
         return self._lists()
@@ -306,8 +309,8 @@ def _gather(
 
 def _short(element: Element, row: int, missing: int) -> FormatError:
     return FormatError(
-        f"expected {number(element.rows)} rows of {element.name}, got a file that is cut short at row {number(row)} by "
-        f"{number(missing)} bytes"
+        f"this PLY is cut short: its header says {number(element.rows)} rows of {element.name}, and at row "
+        f"{number(row)} {number(missing)} bytes are missing"
     )
 
 

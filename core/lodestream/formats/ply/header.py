@@ -139,8 +139,8 @@ def _check_size(header: PlyHeader, size: int) -> None:
         promised += element.rows * sum(sizes)
         if promised > follows + 1:  # the last number of a text may lack its end of line
             raise FormatError(
-                f"expected at least {number(promised)} bytes after the header for {number(element.rows)} rows of "
-                f"{element.name}, got {number(follows)}"
+                f"this PLY is cut short: its header says {number(element.rows)} rows of {element.name}, for which at "
+                f"least {number(promised)} bytes follow it, and {number(follows)} do"
             )
     if len({element.name for element in header.elements}) < len(header.elements):
         raise FormatError("expected elements of different names in a PLY header, got one twice")

@@ -33,5 +33,6 @@ def read(source: Source) -> Surface:
     if mesh.CURVE in names:
         return mesh.read_curve(source, header)
     raise FormatError(
-        f"expected a PLY file with {range_grid.ELEMENT} or {mesh.ELEMENT}, got elements {', '.join(names) or 'none'}"
+        f"this PLY has no faces, only {', '.join(names) or 'no elements'}, so that nothing joins its points to a grid: "
+        f"save it with an element {mesh.ELEMENT}, or with {range_grid.ELEMENT} as scanners do"
     )
