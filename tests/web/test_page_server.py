@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Route, expect
+from playwright.sync_api import APIResponse, Route, expect
 
 import lodestream as ls
 from lodestream_client import Client
@@ -119,6 +119,37 @@ def test_files_are_dropped_found_and_deleted(tabs: Tabs, shelf: Shelf, file: Pat
     page.reload()
     listed(tab)
     expect(link).to_have_count(0)
+
+
+def test_a_surface_that_is_deleted_while_it_is_looked_at_again_stays_away(tabs: Tabs, shelf: Shelf, file: Path) -> None:
+    uploaded = Client(shelf.server).upload(file)
+    tab = tabs(shelf.server)
+    listed(tab)
+    held: list[tuple[Route, APIResponse]] = []
+
+    def as_if_building(route: Route) -> None:
+        answer = route.fetch()
+        found = answer.json()
+        for one in found["surfaces"]:
+            one["state"] = "building" if one["id"] == uploaded.id else one["state"]
+        route.fulfill(response=answer, json=found)
+
+    tab.page.route("**/v1/surfaces?*", as_if_building)
+    tab.page.route(f"{uploaded.url}?*", lambda route: held.append((route, route.fetch())))
+    tab.page.reload()
+    listed(tab)
+    row = tab.page.locator("tbody tr", has_text=file.stem)
+    tab.until(lambda: held)
+    row.get_by_role("button", name="Delete").click()
+    tab.page.get_by_role("dialog").get_by_role("button", name="Delete").click()
+    expect(row).to_have_count(0)
+    ((route, before),) = held
+    tab.page.unroute("**/v1/surfaces?*")
+    with tab.page.expect_response(route.request.url) as answer:
+        route.fulfill(response=before)
+    answer.value.finished()
+    tab.page.evaluate("url => fetch(url).then((answer) => answer.text())", f"{shelf.server}/v1/surfaces?limit=1")
+    expect(row).to_have_count(0)
 
 
 def test_thumbnails_come_with_the_list(tabs: Tabs, shelf: Shelf, heard: Heard, file: Path) -> None:

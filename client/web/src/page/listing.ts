@@ -120,16 +120,24 @@ export class Listing {
     const building = [...this.surfaces.values()].filter(({ state }) => state === "queued" || state === "building");
     if (building.length === 0 || this.closed) return;
     this.timer = setTimeout(async () => {
-      for (const { url, id } of building.slice(0, 20)) {
-        try {
-          this.surfaces.set(id, await this.server.listed(url));
-        } catch (error) {
-          if (error instanceof ProblemError && error.status === 404) this.surfaces.delete(id);
-        }
-      }
+      for (const surface of building.slice(0, 20)) await this.look(surface);
       this.draw();
       this.poll();
     }, POLL);
+  }
+
+  /** Looks at a surface again. What has been learned of it meanwhile is newer than the answer. */
+  private async look(known: ListedSurface): Promise<void> {
+    const { id, url } = known;
+    let found: ListedSurface | null = known;
+    try {
+      found = await this.server.listed(url);
+    } catch (error) {
+      if (error instanceof ProblemError && error.status === 404) found = null;
+    }
+    if (this.surfaces.get(id) !== known) return;
+    if (found === null) this.surfaces.delete(id);
+    else this.surfaces.set(id, found);
   }
 
   private draw(): void {
