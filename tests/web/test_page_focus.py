@@ -13,7 +13,7 @@ import httpx
 import msgpack
 import numpy as np
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Route, expect
 
 from tests.links import Fault, Link, linked
 
@@ -123,6 +123,29 @@ def test_the_error_on_the_screen_falls_to_what_the_server_promised(tabs: Tabs, s
         assert values["error at most"] == "0: exact"
         value = HEIGHTS[int(values["row"]), int(values["column"])]
         assert float(values["height"].removesuffix(" m")) == pytest.approx(float(value), rel=1e-7)
+
+
+def test_a_description_that_comes_late_is_shown(tabs: Tabs, shelf: Shelf) -> None:
+    tab = tabs(shelf.server)
+    held: list[Route] = []
+    described = shelf.description("terrain").url
+    tab.page.get_by_role("heading", name="Surfaces").wait_for()
+    tab.page.route(described, lambda route: held.append(route))
+    tab.page.evaluate(
+        """(src) => {
+          const view = document.createElement("lodestream-view");
+          view.src = src;
+          document.querySelector("main").replaceChildren(view);
+        }""",
+        described,
+    )
+    tab.everything()
+    (route,) = held
+    tab.choose("Colour map", "cividis")
+    tab.press("ArrowLeft")
+    route.continue_()
+    expect(tab.rms).to_have_text("0 m")
+    assert tab.view.get_by_label("Colour map").input_value() == "cividis"
 
 
 def test_a_slow_link_can_be_seen_once_everything_has_come(tabs: Tabs, shelf: Shelf) -> None:

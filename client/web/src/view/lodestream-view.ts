@@ -299,6 +299,7 @@ export class LodestreamView extends HTMLElement {
   }
 
   private takeInfo(info: SurfaceInfo): void {
+    this.viewpoint.relocate();
     const name = this.getAttribute("name") ?? info.name;
     this.canvas.setAttribute(
       "aria-label",
@@ -310,7 +311,7 @@ export class LodestreamView extends HTMLElement {
       this.setLook({ ...this.look, field: { kind: "height" } });
     this.setLook({
       ...this.look,
-      map: this.shared.map ?? mapFor(this.look.field, info),
+      map: this.shared.map ?? (this.latest === null ? mapFor(this.look.field, info) : this.look.map),
       lines: this.shared.lines ?? this.look.lines,
     });
     this.changed("info", info);

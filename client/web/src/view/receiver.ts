@@ -53,7 +53,9 @@ export class Receiver {
       this.headerCame = resolve;
     });
     const described = (description: Description): void => {
-      this.description ??= description;
+      const late = this.description === NO_DESCRIPTION && description !== NO_DESCRIPTION;
+      if (late) this.told = this.askedForErrors = false;
+      if (late || this.description === null) this.description = description;
       this.tell();
     };
     // Of a name the stream learns which surface or container it leads to.

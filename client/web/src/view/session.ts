@@ -53,6 +53,7 @@ export class Session {
   private asked = 0;
   private busy = false;
   private eyeDue = false;
+  private outdated = false;
   private closed = false;
   private userStopped = false;
   private triangles: number;
@@ -73,8 +74,11 @@ export class Session {
     this.post({ kind: "most", triangles });
     source.start({
       info: (info) => {
+        // What came late may place what is drawn elsewhere.
+        this.outdated = this.busy || this.shown !== null;
         this.info = info;
         events.info(info);
+        void this.pump();
       },
       moment: (moment) => {
         this.moments.push(moment);
@@ -234,7 +238,11 @@ export class Session {
     const { level, window } = drawingFor(info, this.triangles, wanted, moment.level, region, shown?.window ?? null);
     const finer = window === null ? level : Number.POSITIVE_INFINITY;
     const had = shown === null ? -1 : shown.window === null ? shown.level : Number.POSITIVE_INFINITY;
-    if (shown?.moment.number === moment.number && had >= finer && (window === null || window === shown.window)) return;
+    const isShown =
+      shown?.moment.number === moment.number && had >= finer && (window === null || window === shown.window);
+    if (isShown && !this.outdated) return;
+    const fresh = shown === null || this.outdated;
+    this.outdated = false;
     this.busy = true;
     try {
       const { grids, moment: number } = await this.source.grids(
@@ -255,7 +263,7 @@ export class Session {
       const { geographic, heights } = info;
       const joined = info.joined || info.blocks.length > 1;
       const [diagonal, relief] = heights ? [0, info.extent] : [info.extent, 0];
-      const options = { joined, geographic, heights, diagonal, relief, fresh: shown === null };
+      const options = { joined, geographic, heights, diagonal, relief, fresh };
       const drawn = window === null ? level : info.levels - Math.log2(window.stride);
       this.post({ kind: "picture", picture: number, level: drawn, grids, options }, [...new Set(buffers)]);
       const patches = await came;

@@ -73,7 +73,7 @@ export class Viewpoint {
     const { framing: before, pose } = this;
     this.framing = framing;
     this.aspect = aspect;
-    if (before === null || pose === null) {
+    if (pose === null) {
       this.chosen ??= given.exaggeration ?? null;
       const exaggeration = this.chosen ?? framing.exaggeration;
       this.home = framing.home(exaggeration, aspect);
@@ -82,13 +82,19 @@ export class Viewpoint {
       this.put({ orbit, exaggeration });
       return;
     }
-    if (before.differs(framing.frame)) {
+    if (before === null) this.put({ orbit: pose.orbit, exaggeration: this.chosen ?? framing.exaggeration });
+    else if (before.differs(framing.frame)) {
       // The same view in the other frame; where it is seen from follows.
       const moved = (orbit: Orbit, by: number): Orbit => framing.toDrawn(before.toSurface(orbit, by), by);
       this.home = this.home === null ? null : moved(this.home, this.exaggeration);
       this.put({ ...pose, orbit: moved(pose.orbit, pose.exaggeration) });
     }
     this.settle(now);
+  }
+
+  /** The next picture has other coordinates: what is seen stays where it is drawn. */
+  relocate(): void {
+    this.framing = null;
   }
 
   /** Takes another size of the view. */

@@ -3,7 +3,7 @@ import { Decoder } from "../../src/decoding/decoder";
 import type { View } from "../../src/decoding/view";
 import { loadKernels } from "../../src/kernels/instance";
 import { Receiver } from "../../src/view/receiver";
-import type { Moment, Progress } from "../../src/view/source";
+import type { Moment, Progress, SurfaceInfo } from "../../src/view/source";
 import { containerOf } from "../golden";
 
 afterEach(() => {
@@ -27,20 +27,22 @@ function host(data: Uint8Array): { data: Uint8Array } {
 
 interface Heard {
   readonly receiver: Receiver;
+  readonly infos: SurfaceInfo[];
   readonly moments: Moment[];
   readonly progress: Progress[];
 }
 
 function receive(): Heard {
+  const infos: SurfaceInfo[] = [];
   const moments: Moment[] = [];
   const progress: Progress[] = [];
   const receiver = new Receiver({
-    info: () => {},
+    info: (info) => infos.push(info),
     moment: (moment) => moments.push(moment),
     progress: (now) => progress.push(now),
     refined: () => {},
   });
-  return { receiver, moments, progress };
+  return { receiver, infos, moments, progress };
 }
 
 it.each(["heights-int16", "blocks-integers"])("%s: what is complete is hashed by the platform, once", async (name) => {
@@ -86,6 +88,29 @@ it("a file that was cut short is of no use to another attempt, also when it is w
   const again = receive();
   await again.receiver.open("http://host/a.lode", null);
   await expect.poll(() => again.progress.at(-1)?.state).toBe("complete");
+});
+
+it("a description that comes after what it describes is told all the same, and nothing else again", async () => {
+  host(containerOf("heights-int16"));
+  const served = fetch;
+  let release = (): void => {};
+  const held = new Promise<void>((resolve) => {
+    release = resolve;
+  });
+  vi.stubGlobal("fetch", async (url: string, options: RequestInit) => {
+    if (new Headers(options.headers).get("range") === "bytes=0-0") await held; // how large it is, for its end
+    return served(url, options);
+  });
+  const { receiver, infos, moments, progress } = receive();
+  await receiver.open("http://host/a.lode", null);
+  await expect.poll(() => moments.at(-1)?.complete).toBe(true);
+  expect(progress.at(-1)?.state).toBe("complete");
+  expect(infos).toMatchObject([{ prices: null }]);
+  const came = moments.length;
+  release();
+  await expect.poll(() => infos.length).toBe(2);
+  expect(infos[1]!.prices?.length).toBeGreaterThan(1);
+  expect(moments.length).toBe(came);
 });
 
 it("a stop before there is a stream holds, until it is to go on", async () => {

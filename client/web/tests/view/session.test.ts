@@ -269,6 +269,47 @@ it("without a picture before nothing is known of the step", async () => {
   session.close();
 });
 
+it("what is drawn is drawn afresh where another description of it comes", async () => {
+  vi.stubGlobal("matchMedia", () => ({ matches: true }));
+  let events!: SourceEvents;
+  const asked: ((grids: MomentGrids) => void)[] = [];
+  const source = {
+    start: (given: SourceEvents) => {
+      events = given;
+    },
+    grids: () => new Promise<MomentGrids>((resolve) => asked.push(resolve)),
+    close: () => {},
+  } as unknown as Source;
+  const stage = {
+    size: [100, 100],
+    eye: () => ({}),
+    show: (_patches: unknown, _fresh: boolean, _blended: boolean, done: () => void) => done(),
+  } as unknown as Stage;
+  const session = new Session(source, stage, UNHEARD, 1e6);
+  const post = vi.spyOn(geometry.last!, "postMessage");
+  const fresh = (): boolean[] =>
+    post.mock.calls.flatMap(([message]) => (message.kind === "picture" ? [message.options.fresh] : []));
+  events.info(INFO);
+  const errors = { rms: 1, max: 1, attributes: [] };
+  events.moment({ number: 0, layer: 0, region: null, level: 5, bytes: 1, seconds: 0, complete: false, ...errors });
+  events.info({ ...INFO }); // while the grids of the first are on their way
+  asked[0]!({ moment: 0, grids: [] });
+  await expect.poll(() => asked.length).toBe(2);
+  asked[1]!({ moment: 0, grids: [] });
+  await expect.poll(() => fresh()).toEqual([true, true]);
+  await expect.poll(() => session.drawnMoment?.number).toBe(0);
+  events.info({ ...INFO });
+  await expect.poll(() => asked.length).toBe(3);
+  asked[2]!({ moment: 0, grids: [] });
+  await expect.poll(() => fresh()).toEqual([true, true, true]);
+  events.moment({ number: 1, layer: 1, region: null, level: 5, bytes: 2, seconds: 0, complete: true, ...errors });
+  await expect.poll(() => asked.length).toBe(4);
+  asked[3]!({ moment: 1, grids: [] });
+  await expect.poll(() => session.drawnMoment?.number).toBe(1);
+  expect(fresh()).toEqual([true, true, true, false]);
+  session.close();
+});
+
 it("what is drawn is a level finer than the data, as far as there are levels", async () => {
   vi.stubGlobal("matchMedia", () => ({ matches: true }));
   let events!: SourceEvents;

@@ -117,6 +117,23 @@ describe("the camera that somebody has placed", () => {
     expect(at.orbit?.target).toEqual([0.5, 0.5, 0]);
   });
 
+  it("stays where it is drawn if the coordinates become others", () => {
+    const { at, poses } = new Seen();
+    at.take(framing(COARSE), 1, 0);
+    at.place(placed);
+    const count = poses.length;
+    at.relocate();
+    const kilometres = { origin: [7000, 9000, 0], scale: [0.0005, 0.0005, 0.5] } as const;
+    const box: Box = [
+      [6000, 8000, -1],
+      [8000, 10_000, 1],
+    ];
+    at.take(framing(box, {}, kilometres), 1, 0);
+    expect(at.orbit).toEqual(placed);
+    expect(at.camera).toEqual(at.framing?.toSurface(placed, at.exaggeration));
+    expect(poses.length).toBeGreaterThan(count); // so that an address has it
+  });
+
   it("is that of an address", () => {
     const { at } = new Seen();
     at.take(framing(COARSE), 1, 0, { camera: placed, exaggeration: 4 });
