@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from random import Random
@@ -43,6 +43,8 @@ class Fault:
         It breaks with a reset, not with an end.
     vanish : bool
         It does not break: nothing more comes, and nobody is told.
+    hold_down : int or None
+        After so many bytes from the server the rest waits for `Link.release`.
     """
 
     delay: float = 0.0
@@ -52,6 +54,7 @@ class Fault:
     cut_up: int | None = None
     reset: bool = False
     vanish: bool = False
+    hold_down: int | None = None
 
 
 class Link:
@@ -90,8 +93,13 @@ class Link:
         for task in self._tasks:
             task.cancel()
 
+    def release(self) -> None:
+        """Hold nothing any more, from any thread."""
+        self._loop.call_soon_threadsafe(self._released.set)
+
     async def __aenter__(self) -> Link:
         self._loop = asyncio.get_running_loop()
+        self._released = asyncio.Event()
         self._server = await asyncio.start_server(self._accept, "127.0.0.1", 0)
         port = self._server.sockets[0].getsockname()[1]
         self.url = urlunsplit(self._parts._replace(netloc=f"127.0.0.1:{port}"))
@@ -133,9 +141,10 @@ class Link:
         near: tuple[asyncio.StreamReader, asyncio.StreamWriter],
         far: tuple[asyncio.StreamReader, asyncio.StreamWriter],
     ) -> None:
+        down, up = _read(far[0], fault.hold_down, self._released), _read(near[0], None, self._released)
         both = [
-            asyncio.ensure_future(_pipe(far[0], near[1], fault, fault.rate, fault.cut_down, self._count)),
-            asyncio.ensure_future(_pipe(near[0], far[1], fault, None, fault.cut_up, None)),
+            asyncio.ensure_future(_pipe(down, near[1], fault, fault.rate, fault.cut_down, self._count)),
+            asyncio.ensure_future(_pipe(up, far[1], fault, None, fault.cut_up, None)),
         ]
         try:
             done, others = await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
@@ -154,8 +163,18 @@ class Link:
         self.down += size
 
 
+async def _read(reader: asyncio.StreamReader, hold: int | None, released: asyncio.Event) -> AsyncIterator[bytes]:
+    while data := await reader.read(min(_CHUNK, hold or _CHUNK)):
+        yield data
+        if hold is not None:
+            hold -= len(data)
+            if hold == 0:
+                await released.wait()
+                hold = None
+
+
 async def _pipe(
-    reader: asyncio.StreamReader,
+    source: AsyncIterator[bytes],
     writer: asyncio.StreamWriter,
     fault: Fault,
     rate: float | None,
@@ -175,7 +194,7 @@ async def _pipe(
         nonlocal queued, ended
         free = 0.0
         try:
-            while data := await reader.read(_CHUNK):
+            async for data in source:
                 step = fault.pieces or packet
                 for start in range(0, len(data), step):
                     piece = data[start : start + step]

@@ -84,6 +84,9 @@ _VALUES = """view => {
   return [...values.children].map(({ children }) => [...children].map(({ textContent }) => textContent.trim()));
 }"""
 
+# Whether it has failed and does not try again by itself, as it does once if what came until then looked done.
+_FAILED = """view => window.states.at(-1) === "failed" && view.session?.looksDone === false"""
+
 _STATE = """view => ({
   info: view.info,
   moments: view.moments.map(({number, level, bytes, rms, max, complete}) =>
@@ -220,10 +223,14 @@ class Tab:
         """The statuses that were shown so far, each with RMS and maximum error as they stood beside it."""
         return [text.split(" | ") for text in self.page.evaluate("window.beside")]
 
-    def failed(self, times: int) -> None:
-        """Wait until the transmission has failed so often, and says so."""
-        self.until(lambda: self.page.evaluate("window.states").count("failed") == times)
+    def failed(self) -> None:
+        """Wait until the transmission has failed, and says so."""
+        self.until(lambda: self.view.evaluate(_FAILED))
         self.shown("Failed")
+
+    def try_again(self) -> None:
+        """Press the button after a failure; states that were told until then are forgotten."""
+        self.button("Try again").evaluate("button => { window.states = []; button.click(); }")
 
     @property
     def moments(self) -> list[dict[str, Any]]:

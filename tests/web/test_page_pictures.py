@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from playwright.sync_api import expect
 
 from .browser import Heard
 from .conftest import Tabs
@@ -27,6 +28,7 @@ def test_nothing_hangs_over(tabs: Tabs, shelf: Shelf, heard: Heard, scheme: str,
     assert tab.page.evaluate(fits)
     for name in ("terrain", "torus"):
         tab.page.goto(shelf.address(name))
+        expect(tab.page.locator("header h1")).to_have_text(name)  # the one before stays until the server has answered
         tab.everything("m" if name == "terrain" else "")
         tab.point(0.5, 0.55)
         tab.picture()
