@@ -54,7 +54,7 @@ def read(source: Source) -> Surface:
     file = io.BytesIO(plain + _CHUNK.pack(len(text), b"JSON") + text + _CHUNK.pack(len(binary), b"BIN\0") + binary)
     parts = parts_of(file, "glb")
     if not parts:
-        raise FormatError("expected a scene with triangles, got one without any")
+        raise FormatError("this GLB has no triangles in its scene")
     vertices = sum(len(part.vertices) for part, _ in parts)  # a mesh may be at many places
     source.check_vertices(vertices, f"{number(vertices)} vertices of all meshes in the scene")
     check_faces(source, sum(len(part.faces) for part, _ in parts))
@@ -76,19 +76,22 @@ def _parts(content: bytes) -> tuple[dict[str, Any], bytes]:
     FormatError
     """
     if len(content) < _HEAD.size + _CHUNK.size:
-        raise FormatError(f"expected GLB with a header, got {number(len(content))} bytes")
+        raise FormatError(f"this GLB is cut short in its header: it has {number(len(content))} bytes")
     _, version, length = _HEAD.unpack_from(content)
-    if version != 2 or length != len(content):
-        raise FormatError(
-            f"expected glTF 2 of {number(length)} bytes, as it says, got version {version} and {number(len(content))}"
-        )
+    if version != 2:
+        raise FormatError(f"this GLB has version {version} of glTF: export it again with version 2")
+    if length != len(content):
+        words = "is cut short" if len(content) < length else "goes on behind its end"
+        raise FormatError(f"this GLB {words}: it says {number(length)} bytes, and has {number(len(content))}")
     chunks: dict[bytes, bytes] = {}
     place = _HEAD.size
     while place + _CHUNK.size <= length:
         size, kind = _CHUNK.unpack_from(content, place)
         place += _CHUNK.size
         if place + size > length:
-            raise FormatError(f"expected a chunk of {number(size)} bytes, got {number(length - place)}")
+            raise FormatError(
+                f"this GLB is damaged: a chunk says {number(size)} bytes, and {number(length - place)} are left"
+            )
         chunks.setdefault(kind, content[place : place + size])
         place += size
     try:
@@ -96,7 +99,7 @@ def _parts(content: bytes) -> tuple[dict[str, Any], bytes]:
     except (ValueError, RecursionError):
         scene = None
     if not isinstance(scene, dict):
-        raise FormatError("expected a scene as JSON in the first chunk, got something else")
+        raise FormatError("this GLB is damaged: it has no chunk with a scene in JSON")
     return scene, chunks.get(b"BIN\0", b"")
 
 
@@ -119,9 +122,12 @@ def _check(source: Source, scene: dict[str, Any]) -> list[str]:
     required = scene.get("extensionsRequired", [])
     foreign = [name for name in required if not str(name).startswith(_HARMLESS)] if isinstance(required, list) else []
     if foreign:
-        raise FormatError(f"expected GLB without compressed or packed points, got the extension {str(foreign[0])[:60]}")
+        raise FormatError(
+            f"this GLB needs the extension {str(foreign[0])[:60]}: export it again without, so that its points are "
+            "neither compressed nor packed"
+        )
     if any("uri" in buffer for buffer in _maps(scene, "buffers")):
-        raise FormatError("expected GLB that holds its buffers itself, got one that names another file")
+        raise FormatError("this GLB names another file, and none is opened: export it again with its buffers in it")
     views: list[Any] = [view.get("byteLength") for view in _maps(scene, "bufferViews")]
     # trimesh copies each; views of one part of a buffer are rare.
     if not all(isinstance(length, int) and length >= 0 for length in views) or sum(views) > 2 * source.size:
@@ -141,7 +147,7 @@ def _check(source: Source, scene: dict[str, Any]) -> list[str]:
     primitives = [primitive for mesh in _maps(scene, "meshes") for primitive in _maps(mesh, "primitives")]
     modes = [primitive.get("mode", _TRIANGLES) for primitive in primitives]
     if _FAN in modes:
-        raise FormatError("expected triangles and strips of GLB, got fans")
+        raise FormatError("this GLB has fans of triangles: export it again as single triangles or strips")
     notes = ["lines and points of the scene left out"] * any(mode not in (_TRIANGLES, _STRIP) for mode in modes)
     notes += ["further shapes (morph targets) left out"] * any(primitive.get("targets") for primitive in primitives)
     return notes + ["textures left out"] * bool(scene.get("textures"))
@@ -197,7 +203,7 @@ def _placed(mesh: Mesh, matrix: NDArray[np.float64]) -> Mesh:
             "expected meshes of GLB at finite places, got one with a matrix that is not finite, or beyond"
         )
     if determinant == 0:
-        raise FormatError("expected meshes of GLB at places in space, got one that its matrix makes flat")
+        raise FormatError("this GLB has a mesh that its matrix makes flat: export it again with another scale")
     if NORMAL in attributes:
         normals = attributes[NORMAL] @ np.linalg.inv(turn)
         length = np.linalg.norm(normals, axis=1, keepdims=True)

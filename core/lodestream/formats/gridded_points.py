@@ -100,7 +100,10 @@ def surface(source: Source, table: Vector, names: Sequence[str]) -> Surface:
         If the points are no grid, or two of them have the same place and different values.
     """
     if table.shape[1] < 3:
-        raise FormatError(f"expected at least three columns, x, y and z, got {table.shape[1]}")
+        raise FormatError(
+            f"this file has {table.shape[1]} columns, and points have three at least, x, y and z: layout=heights takes "
+            "the columns for heights"
+        )
     roles = _roles(names)
     x, y = table[:, roles[0]], table[:, roles[1]]
     with np.errstate(over="ignore"):  # a step that is infinite is one all the same
@@ -188,13 +191,13 @@ def _axes(x: Vector, y: Vector) -> tuple[_Axis, _Axis]:
     count = len(x)
     across, down = _different(x), _different(y)
     if across is None or down is None:
-        raise FormatError(f"expected a grid of points x y z, got x or y that are no numbers{_HINT}")
+        raise FormatError(f"these points x y z are no grid, since some x or y are no numbers{_HINT}")
     sizes = len(across), len(down)
     # Points in a line, or on the diagonal, are no grid, however few.
     if min(sizes) < 2 or 2 * count < 3 * max(sizes) or prod(sizes) > _MOST_NODES * count:
         raise FormatError(
-            f"expected a grid along x and y, got {number(count)} points x y z with {number(len(across))} values of x "
-            f"and {number(len(down))} of y{_HINT}"
+            f"these {number(count)} points x y z are no grid along x and y, with {number(len(across))} values of x and "
+            f"{number(len(down))} of y{_HINT}"
         )
     whole = prod(sizes) == count
     across, down = _without_gaps(across, "x", whole), _without_gaps(down, "y", whole)
@@ -210,8 +213,8 @@ def _axes(x: Vector, y: Vector) -> tuple[_Axis, _Axis]:
 
 
 _HINT = (
-    ": rotated and curvilinear grids are read from a file for each of x, y and z, scattered points not at all; "
-    "layout=heights takes the columns for heights"
+    ": rotated and curvilinear grids are read from a file for each of x, y and z, scattered points once they are "
+    "interpolated to a grid; layout=heights takes the columns for heights"
 )
 
 

@@ -384,7 +384,7 @@ def rotated() -> Array:
 @pytest.mark.parametrize("suffix", [".txt", ".xyz"])
 def test_points_that_are_no_grid_are_refused(tmp_path: Path, points: Array, suffix: str) -> None:
     with pytest.raises(
-        FormatError, match=r"expected a grid along x and y, got [\d,]+ points x y z with .* of y: "
+        FormatError, match=r"these [\d,]+ points x y z are no grid along x and y, with .* of y: "
     ) as caught:
         read(tmp_path / f"a{suffix}", lines_of(points))
     assert "layout=heights takes the columns for heights" in str(caught.value)
@@ -401,7 +401,7 @@ def test_the_layout_may_be_said(tmp_path: Path) -> None:
     assert surface.shape == (3, 4)
     with pytest.raises(OptionError, match="expected layout=heights or layout=points, got 'rows'"):
         read(tmp_path / "a.txt", lines_of(more), layout="rows")
-    with pytest.raises(FormatError, match="at least three columns, x, y and z, got 2"):
+    with pytest.raises(FormatError, match="this file has 2 columns, and points have three at least"):
         read(tmp_path / "a.txt", "1 2\n3 4\n", layout="points")
     with pytest.raises(OptionError, match="expected layout=points for one file, got 2 files"):
         formats.read(tmp_path / "a.txt", tmp_path / "a.txt", layout="points")

@@ -270,7 +270,7 @@ CASES: dict[str, tuple[str, Callable[[], bytes], dict[str, Any], str, str]] = {
         "FormatError",
         "expected structured grids that VTK reads",
     ),
-    "GLB": ("a.glb", lambda: b"glTF\2\0\0\0" + bytes(99), {}, "FormatError", "expected glTF 2 of 0 bytes, as it says"),
+    "GLB": ("a.glb", lambda: b"glTF\2\0\0\0" + bytes(99), {}, "FormatError", "goes on behind its end: it says 0 bytes"),
     "STL": (
         "a.stl",
         lambda: bytes(80) + b"\xff" * 99,

@@ -143,7 +143,7 @@ def test_several_files_are_blocks(tmp_path: Path) -> None:
     assert [block.shape for block in surface.blocks] == [(4, 3), (2, 5)]
     np.testing.assert_array_equal(surface.blocks[1].points, points_of((1, 5, 2)).reshape(2, 5, 3) + 1)
     (tmp_path / "1.vts").write_text("<VTKFile type='PolyData'></VTKFile>")
-    with pytest.raises(FormatError, match=r"1\.vts: expected a VTK file of type StructuredGrid, got PolyData"):
+    with pytest.raises(FormatError, match=r"1\.vts: this is a VTK file of type PolyData, not StructuredGrid: "):
         formats.read(tmp_path / "0.vts", tmp_path / "1.vts")
 
 
@@ -158,7 +158,7 @@ def test_images_and_rectilinear_grids_are_refused_with_what_to_do(tmp_path: Path
         grid = pyvista.RectilinearGrid(np.array([0.0, 1, 3]), np.array([0.0, 2]))
     grid["heat"] = np.arange(grid.n_points)
     grid.save(path)
-    with pytest.raises(FormatError, match=f"of type StructuredGrid, got {kind}: save it as .vts") as caught:
+    with pytest.raises(FormatError, match=f"of type {kind}, not StructuredGrid: save it as .vts") as caught:
         formats.read(path)
     assert f"pyvista.read('a{suffix}').cast_to_structured_grid().save('a.vts')" in str(caught.value)
     pyvista.read(path).cast_to_structured_grid().save(tmp_path / "a.vts")  # as the advice says
@@ -250,7 +250,7 @@ def test_a_file_by_hand_is_read(tmp_path: Path) -> None:
         (vts("").replace(b"Float64", b"String"), "of a type of VTK and 1 to 99999 components, got 'String'"),
         (vts("").replace(b'Components="3"', b'Components="-3"'), "1 to 99999 components, got .* '-3'"),
         (HEAD.encode() + b"</VTKFile>", "a WholeExtent and a Piece, got none"),
-        (HEAD.replace("StructuredGrid", "PolyData").encode() + b"</VTKFile>", "StructuredGrid, got PolyData"),
+        (HEAD.replace("StructuredGrid", "PolyData").encode() + b"</VTKFile>", "of type PolyData, not StructuredGrid"),
         (b"<?xml version='1.0'?>" + HEAD.encode() + b"<a>", "XML file of VTK, got no element|got mismatched|unclosed"),
         (b"<?xml version='1.0'?><!DOCTYPE a [<!ENTITY b 'c'>]>" + HEAD.encode(), "XML without a DOCTYPE"),
         (
@@ -395,9 +395,9 @@ LEGACY = (
         (
             LEGACY.replace("STRUCTURED_GRID", "POLYDATA"),
             FormatError,
-            "STRUCTURED_GRID or RECTILINEAR_GRID, got POLYDATA",
+            "has POLYDATA, and may have STRUCTURED_GRID or RECTILINEAR_GRID: save it as",
         ),
-        (LEGACY.replace("DATASET", "DATA"), FormatError, "got no DATASET"),
+        (LEGACY.replace("DATASET", "DATA"), FormatError, "has no DATASET, and may have"),
         (
             LEGACY.replace("POINTS 6", "POINTS 6000000000"),
             TooLargeError,

@@ -49,7 +49,10 @@ def read(source: Source) -> Surface:
     dataset = re.search(rb"^\s*DATASET\s+(\w+)", head, re.MULTILINE | re.IGNORECASE)
     kind = dataset[1].decode("ascii", "replace").upper() if dataset else "no DATASET"
     if kind not in _READERS:
-        raise FormatError(f"expected a VTK file with DATASET {' or '.join(_READERS)}, got {kind[:40]}")
+        raise FormatError(
+            f"this VTK file has {kind[:40]}, and may have {' or '.join(_READERS)}: save it as one of these, or a mesh "
+            "of polygons as PLY"
+        )
     points = re.search(rb"^POINTS\s+(\d{1,18})\s", head, re.MULTILINE | re.IGNORECASE)
     if points and int(points[1]) * 6 > source.size:
         raise TooLargeError(

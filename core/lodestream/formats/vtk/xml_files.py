@@ -135,12 +135,12 @@ def _checked(path: Path) -> tuple[Dims, int, Mapped | None]:
     kind = content.root.get("type", "none")
     if kind == "vtkMultiBlockDataSet":
         raise FormatError(
-            "expected the grids themselves, got a .vtm file, which only names other files, and these are never opened: "
+            "this is a .vtm file, which only names other files, and these are never opened: "
             "give its .vts files together, one for each block, as in lodestream.read('a/a_0.vts', 'a/a_1.vts')"
         )
     if kind != "StructuredGrid":
         advice = _ADVICE.get(kind, "")
-        raise FormatError(f"expected a VTK file of type StructuredGrid, got {kind[:60]}{advice}")
+        raise FormatError(f"this is a VTK file of type {kind[:60]}, not StructuredGrid{advice}")
     if not content.whole or not content.pieces:
         raise FormatError("expected a StructuredGrid with a WholeExtent and a Piece, got none")
     promised = sum(array.promised() for array in content.arrays)
