@@ -173,18 +173,36 @@ def upload(
 
 
 def _sent(url: str, parameters: Mapping[str, str | list[str]], body: Body) -> Flow[Description]:
-    """Send files: a large one so that it goes on after a lost connection, where the server can do that."""
-    named = _named(parameters, body)
-    if len(body.files) == 1 and body.size >= resuming.LEAST:
-        yield Aside(body.hash)
-        uploads = addresses.uploads_url(url)
-        begun = yield Call("POST", uploads, named, headers=resuming.beginning(body))
-        if begun is not None and not resuming.is_absent(begun):
-            surface = yield from resuming.completed(uploads, _location(begun, uploads), body)
-            return _described(_checked((yield Call("GET", surface)), surface), surface)
+    """Send files: a large one so that it goes on after a lost connection, and a small one so if it has lost one."""
+    named, alone = _named(parameters, body), len(body.files) == 1
+    if alone and body.size >= resuming.LEAST and (surface := (yield from _in_parts(url, named, body))) is not None:
+        return surface
     collection = addresses.surfaces_url(url)
-    answer = yield Call("POST", collection, named, body=body)
+    try:
+        answer = yield Call("POST", collection, named, body=body)
+    except LodestreamError as error:
+        lost = problems.passes(error) and not isinstance(error, RemoteError)
+        if not lost or not alone or body.left == body.size or body.size >= resuming.LEAST:
+            raise
+        # Or it was refused: a server may cut such a connection before its answer is read. What begins an upload has no
+        # body, so that it is told then.
+        body.go_to(0)
+        surface = yield from _in_parts(url, named, body)
+        if surface is None:
+            raise
+        return surface
     return _described(_checked(answer, collection), _location(answer, collection))
+
+
+def _in_parts(url: str, named: Mapping[str, str | list[str]], body: Body) -> Flow[Description | None]:
+    """Send the one file so that it goes on after a lost connection; return None where the server cannot do that."""
+    yield Aside(body.hash)
+    uploads = addresses.uploads_url(url)
+    begun = yield Call("POST", uploads, named, headers=resuming.beginning(body))
+    if begun is None or resuming.is_absent(begun):
+        return None
+    surface = yield from resuming.completed(uploads, _location(begun, uploads), body)
+    return _described(_checked((yield Call("GET", surface)), surface), surface)
 
 
 def formats_read(url: str) -> Flow[frozenset[str] | None]:

@@ -16,13 +16,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lodestream as ls
-from lodestream.errors import InputError, LodestreamError, NotFoundError, RemoteProtocolError
+from lodestream.errors import InputError, LodestreamError, NotFoundError, RemoteProtocolError, TooLargeError
 from lodestream_client import Client
 from lodestream_client.errors import UnreachableError
 from lodestream_client.requests import resuming
 from lodestream_client.requests.answers import Answer
 from lodestream_client.requests.bodies import Body
 from lodestream_client.requests.calls import Call, Pause
+from lodestream_server import running_server
 from tests.links import Fault, linked
 from tests.server.programs import Server
 
@@ -194,6 +195,32 @@ def test_uploads_arrive_over_links_that_break(seed: int, server: str, monkeypatc
     with client.connect(ready.id) as stream:
         *_, last = stream
     assert np.array_equal(last.points, heights)
+
+
+def test_a_small_upload_goes_on_after_lost_connections(server: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resuming, "_FIRST_PAUSE", 0.001)
+    file = io.BytesIO()
+    np.save(file, np.random.default_rng(7).normal(size=(120, 90)))
+
+    def upload(broken: int) -> tuple[int, str]:
+        """Return the number of connections that an upload takes if so many of them break, and its surface."""
+        with linked(server, lambda number: Fault(cut_up=20_000, reset=True) if number < broken else Fault()) as link:
+            with Client(link.url) as client:
+                surface = client.upload(file.getvalue(), filename="a.npy", wait=False)
+            return link.connections, surface.id
+
+    made = [upload(broken) for broken in range(4)]
+    assert [connections for connections, _ in made] == [1, 2, 3, 4]
+    assert len({surface for _, surface in made}) == 1
+
+
+def test_a_refusal_is_told_though_the_connection_was_cut_while_the_file_was_sent(tmp_path: Path) -> None:
+    """A file that fills what the system keeps of a connection whose other end does not read, and is no large one."""
+    with (
+        running_server(tmp_path / "data", workers=1, upload_bytes=1000) as url,
+        pytest.raises(TooLargeError, match="may have 1000"),
+    ):
+        Client(url).upload(bytes(resuming.LEAST - 1), filename="a.npy")
 
 
 def test_a_server_without_such_uploads_gets_them_in_one(server: str, monkeypatch: pytest.MonkeyPatch) -> None:
