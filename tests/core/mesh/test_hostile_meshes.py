@@ -72,7 +72,7 @@ def twisted_rings() -> NDArray[np.int64]:
 
 
 CASES = {
-    "soup": (soup, "pieces of 30,000 faces"),
+    "soup": (soup, "pieces, of 30,000 faces"),
     "stairs": (stairs, "irregular vertices"),
     "many fans": (many_fans, "with six round every inner vertex"),
     "tangle": (tangle, "each edge to join at most two faces"),
