@@ -6,9 +6,10 @@ import base64
 from itertools import count
 from pathlib import Path
 
+import httpx
 import numpy as np
 import pytest
-from playwright.sync_api import APIResponse, Route, expect
+from playwright.sync_api import Route, expect
 
 import lodestream as ls
 from lodestream_client import Client
@@ -123,30 +124,22 @@ def test_files_are_dropped_found_and_deleted(tabs: Tabs, shelf: Shelf, file: Pat
 
 def test_a_surface_that_is_deleted_while_it_is_looked_at_again_stays_away(tabs: Tabs, shelf: Shelf, file: Path) -> None:
     uploaded = Client(shelf.server).upload(file)
+    before = httpx.get(f"{uploaded.url}?thumbnails=true", trust_env=False).json()
+    building = {"surfaces": [{**before, "state": "building"}], "next": None}
     tab = tabs(shelf.server)
     listed(tab)
-    held: list[tuple[Route, APIResponse]] = []
-
-    def as_if_building(route: Route) -> None:
-        answer = route.fetch()
-        found = answer.json()
-        for one in found["surfaces"]:
-            one["state"] = "building" if one["id"] == uploaded.id else one["state"]
-        route.fulfill(response=answer, json=found)
-
-    tab.page.route("**/v1/surfaces?*", as_if_building)
-    tab.page.route(f"{uploaded.url}?*", lambda route: held.append((route, route.fetch())))
+    held: list[Route] = []
+    tab.page.route("**/v1/surfaces?*", lambda route: route.fulfill(json=building))
+    tab.page.route(f"{uploaded.url}?*", lambda route: held.append(route))
     tab.page.reload()
-    listed(tab)
     row = tab.page.locator("tbody tr", has_text=file.stem)
     tab.until(lambda: held)
     row.get_by_role("button", name="Delete").click()
     tab.page.get_by_role("dialog").get_by_role("button", name="Delete").click()
     expect(row).to_have_count(0)
-    ((route, before),) = held
-    tab.page.unroute("**/v1/surfaces?*")
+    (route,) = held
     with tab.page.expect_response(route.request.url) as answer:
-        route.fulfill(response=before)
+        route.fulfill(json=before)
     answer.value.finished()
     tab.page.evaluate("url => fetch(url).then((answer) => answer.text())", f"{shelf.server}/v1/surfaces?limit=1")
     expect(row).to_have_count(0)
