@@ -10,6 +10,7 @@ import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, TypeAlias
 
 from lodestream.errors import (
@@ -198,11 +199,18 @@ def _in_parts(url: str, named: Mapping[str, str | list[str]], body: Body) -> Flo
     """Send the one file so that it goes on after a lost connection; return None where the server cannot do that."""
     yield Aside(body.hash)
     uploads = addresses.uploads_url(url)
-    begun = yield Call("POST", uploads, named, headers=resuming.beginning(body))
-    if begun is None or resuming.is_absent(begun):
+    begin = partial(_begun, uploads, named, body)
+    address = yield from begin()
+    if address is None:
         return None
-    surface = yield from resuming.completed(uploads, _location(begun, uploads), body)
+    surface = yield from resuming.completed(uploads, address, body, begin)
     return _described(_checked((yield Call("GET", surface)), surface), surface)
+
+
+def _begun(uploads: str, named: Mapping[str, str | list[str]], body: Body) -> Flow[str | None]:
+    """Begin an upload in parts, and return its address; None if the server knows no such uploads."""
+    answer = yield Call("POST", uploads, named, headers=resuming.beginning(body))
+    return None if answer is None or resuming.is_absent(answer) else _location(answer, uploads)
 
 
 def formats_read(url: str) -> Flow[frozenset[str] | None]:

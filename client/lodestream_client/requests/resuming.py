@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import base64
 import random
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
-from lodestream.errors import LodestreamError, RemoteProtocolError
+from lodestream.errors import LodestreamError, NotFoundError, RemoteProtocolError
 
 from . import addresses, problems
 from .answers import Answer
@@ -30,6 +30,10 @@ _LONGEST_PAUSE = 30.0
 # Statuses of `_NoFurtherError`.
 _ELSEWHERE = (409, 423)
 
+# Statuses of servers that do not have the upload any more, and how often it begins again.
+_LOST = (404, 410)
+_LOSSES = 3
+
 # Statuses of servers that know no such uploads.
 _ABSENT = (404, 405)
 
@@ -45,31 +49,40 @@ def is_absent(answer: Answer) -> bool:
     return answer.status in _ABSENT and not problems.is_ours(answer.content)
 
 
-def completed(uploads: str, address: str, body: Body) -> Flow[str]:
+def completed(uploads: str, address: str, body: Body, begin: Callable[[], Flow[str | None]]) -> Flow[str]:
     """Send a body to an upload at `address`, which has begun at `uploads`, and return the URL of its surface.
 
     After a lost connection, or an answer that may be another one soon, the server is asked how far it is, and the
-    upload goes on there.
+    upload goes on there. If the server does not have it any more, such as one that has taken the place of another, it
+    begins again, by `begin`, which returns its new address.
 
     Raises
     ------
     LodestreamError
         If the server refuses the upload, or it comes no further although it was tried again and again.
     """
-    offset, asks, failures = 0, False, 0
-    _own(address, uploads)
+    offset, asks, failures, losses = 0, False, 0, 0
+    place: str | None = _own(address, uploads)
     while True:
         wait = 0.0
         try:
-            answer = yield (_question(address) if asks else _part(address, body, offset))
+            if place is None:
+                begun = yield from begin()
+                if begun is None:
+                    raise NotFoundError(f"{uploads} takes no upload in parts any more")
+                place, offset, asks = _own(begun, uploads), 0, False
+            answer = yield (_question(place) if asks else _part(place, body, offset))
             assert answer is not None
             wait = _asked(answer)
-            _refuse(answer, address)
+            if answer.status in _LOST and losses < _LOSSES:
+                place, losses = None, losses + 1
+                continue
+            _refuse(answer, place)
             if location := answer.headers.get("location"):
-                return _own(addresses.resolved(address, location), uploads)
-            reached = _offset(answer, address, body.size)
+                return _own(addresses.resolved(place, location), uploads)
+            reached = _offset(answer, place, body.size)
             if reached == offset and not asks:
-                raise _NoFurtherError(f"{address} took no more of the upload, and did not say why")
+                raise _NoFurtherError(f"{place} took no more of the upload, and did not say why")
             failures = 0 if reached > offset else failures
             offset, asks = reached, False
         except LodestreamError as error:

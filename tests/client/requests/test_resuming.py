@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -19,10 +20,10 @@ import lodestream as ls
 from lodestream.errors import InputError, LodestreamError, NotFoundError, RemoteProtocolError, TooLargeError
 from lodestream_client import Client
 from lodestream_client.errors import UnreachableError
-from lodestream_client.requests import resuming
+from lodestream_client.requests import problems, resuming
 from lodestream_client.requests.answers import Answer
 from lodestream_client.requests.bodies import Body
-from lodestream_client.requests.calls import Call, Pause
+from lodestream_client.requests.calls import Call, Flow, Pause
 from lodestream_server import running_server
 from tests.links import Fault, linked
 from tests.server.programs import Server
@@ -47,6 +48,9 @@ class Other:
     def answer(self, call: Call, take: int | None = None) -> Answer:
         """Answer as a server does that takes only so many bytes of what is sent."""
         self.calls.append(call.method)
+        if call.method == "POST":
+            self.has = b""
+            return Answer(201, "Created", {"location": ADDRESS})
         if call.method == "PATCH":
             assert call.body is not None
             if int(call.headers["Upload-Offset"]) != len(self.has):
@@ -57,7 +61,7 @@ class Other:
 
     def run(self, sent: Body, respond: Callable[[Call], Answer]) -> str:
         """Carry out an upload; `respond` answers, or raises what the client sees."""
-        flow = resuming.completed(UPLOADS, ADDRESS, sent)
+        flow = resuming.completed(UPLOADS, ADDRESS, sent, _begun)
         step = next(flow)
         try:
             while True:
@@ -74,6 +78,14 @@ class Other:
                     step = flow.send(answer)
         except StopIteration as end:
             return str(end.value)
+
+
+def _begun() -> Flow[str | None]:
+    answer = yield Call("POST", UPLOADS)
+    assert answer is not None
+    if answer.status != 201:
+        raise problems.from_response(answer.status, answer.reason, answer.content, UPLOADS)
+    return answer.headers["location"]
 
 
 def test_an_upload_without_faults_is_one_request() -> None:
@@ -125,6 +137,40 @@ def test_it_gives_up_when_it_comes_no_further() -> None:
             server.run(body(), partial(_always, answer))
 
 
+@pytest.mark.parametrize("status", [404, 410])
+def test_an_upload_that_the_server_has_lost_begins_again(status: int) -> None:
+    """As at a server that has taken the place of the one where it began, and is not ready at once."""
+    server, asked = Other(), list[str]()
+
+    def respond(call: Call) -> Answer:
+        asked.append(call.method)
+        if len(asked) == 1:
+            server.answer(call, 40)
+            raise UnreachableError("no connection")
+        if len(asked) < 5:
+            return Answer(503 if call.method == "POST" else status, "", {})
+        return server.answer(call)
+
+    assert server.run(body(), respond) == "http://host/v1/surfaces/1"
+    assert server.has == DATA
+    assert asked == ["PATCH", "HEAD", "POST", "POST", "POST", "PATCH"]
+
+
+def test_an_upload_that_is_lost_again_and_again_is_given_up() -> None:
+    server, asked = Other(), list[str]()
+
+    def respond(call: Call) -> Answer:
+        asked.append(call.method)
+        if call.method == "PATCH" and server.calls.count("PATCH") % 2:
+            return Answer(404, "Not Found", {}, b'{"code": "not-found", "detail": "No upload 0 on this server"}')
+        return server.answer(call, 40)
+
+    server.calls.append("PATCH")
+    with pytest.raises(NotFoundError, match="No upload 0"):
+        server.run(body(), respond)
+    assert asked.count("POST") == 3
+
+
 def _always(answer: Answer, call: Call) -> Answer:
     return answer
 
@@ -133,7 +179,6 @@ def _always(answer: Answer, call: Call) -> Answer:
     ("answer", "error", "words"),
     [
         (Answer(422, "", {}, b'{"code": "bad-input", "detail": "other bytes"}'), InputError, "other bytes"),
-        (Answer(404, "Not Found", {}), LodestreamError, "404"),
         (Answer(507, "", {}, b'{"code": "full", "detail": "full"}'), LodestreamError, "full"),
         (Answer(204, "", {}), RemoteProtocolError, "how far"),
         (Answer(204, "", {"upload-offset": "101"}), RemoteProtocolError, "how far"),
@@ -155,7 +200,7 @@ def test_what_is_final_is_told_at_once(answer: Answer, error: type[LodestreamErr
 
 def test_an_upload_elsewhere_is_not_sent() -> None:
     with pytest.raises(RemoteProtocolError, match="expected an address on http://host"):
-        next(resuming.completed(UPLOADS, "http://other/v1/uploads/0", body()))
+        next(resuming.completed(UPLOADS, "http://other/v1/uploads/0", body(), _begun))
 
 
 def test_the_beginning_says_what_comes() -> None:
@@ -235,6 +280,36 @@ def test_where_no_server_is_the_first_answer_is_told(server: str, monkeypatch: p
     monkeypatch.setattr(resuming, "LEAST", 1000)
     with pytest.raises(NotFoundError, match="No such address on this server: '/maps/v1/uploads'"):
         Client(f"{server}/maps").upload(ls.Surface(np.random.default_rng(9).normal(size=(30, 20))))
+
+
+def test_an_upload_begins_again_where_its_parts_are_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where another server takes over, which has no scratch folder of the one before."""
+    monkeypatch.setattr(resuming, "LEAST", 1000)
+    monkeypatch.setattr(resuming, "_LONGEST_PAUSE", 0.5)
+    monkeypatch.setattr(resuming, "_ATTEMPTS", 200)
+    file = io.BytesIO()
+    np.save(file, np.random.default_rng(6).normal(size=(1000, 1000)).astype(np.float32))
+    running, lost = Server(tmp_path / "data"), False
+    port = urlsplit(running.url).port
+
+    def sent(stage: str, fraction: float) -> None:
+        nonlocal running, lost
+        if stage == "sending" and fraction > 0.5 and not lost:
+            lost = True
+            running.kill()
+            shutil.rmtree(tmp_path / "data" / "scratch")
+            running = Server(tmp_path / "data", port=port)
+
+    try:
+        surface = Client(running.url).upload(file.getvalue(), filename="a.npy", progress=sent, wait=False)
+        assert lost
+        with running.client() as http:
+            assert http.get(surface.url).json()["upload_bytes"] == len(file.getvalue())
+            assert len(http.get("/v1/surfaces").json()["surfaces"]) == 1
+    finally:
+        running.kill()
+    (upload,) = (tmp_path / "data" / "uploads").iterdir()
+    assert (upload / "0").read_bytes() == file.getvalue()
 
 
 @pytest.mark.long
