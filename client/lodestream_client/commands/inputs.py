@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lodestream.errors import FormatWarning, LodestreamError
+from lodestream.errors import FormatWarning, InputError, LodestreamError
 
 __all__ = [
     "Inputs",
@@ -41,7 +41,19 @@ def input_files(names: Sequence[str]) -> Iterator[Inputs]:
     """Yield the files with these names; standard input (``-``), at most once, is copied to a temporary file.
 
     Readers and uploads need to know the length first, and the end of a container before its middle.
+
+    Raises
+    ------
+    InputError
+        If one is an address.
     """
+    from lodestream.opening.open_source import is_address
+
+    for name in filter(is_address, names):
+        raise InputError(
+            f"{name} is an address, and this command reads files: download it, or receive a container that is on a "
+            "server or a web host by lodestream pull"
+        )
     if "-" not in names:
         yield Inputs(tuple(map(Path, names)), None)
         return

@@ -29,6 +29,16 @@ def test_options_are_named_as_the_command_line_has_them(text: str, words: str) -
     assert option_words(text, ["sea plane=1.nc"]) == words
 
 
+@pytest.mark.parametrize("address", ["s3://bucket/a.lode", "https://host/a.lode"])
+def test_an_address_is_no_file(address: str, tmp_path: Path, run: Run) -> None:
+    out, container = tmp_path / "out.npy", tmp_path / "out.lode"
+    for words in (["decode", address, out], ["encode", address, container], ["convert", address, out]):
+        code, stdout, stderr = run(*words)
+        assert (code, stdout) == (1, "")
+        assert stderr.startswith(f"lodestream: {address} is an address, and this command reads files: download it, or ")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_notes_of_a_reader_are_worded_too(recwarn: pytest.WarningsRecorder) -> None:
     with option_hints(["a.nc"]):
         warnings.warn("take them with attributes=", FormatWarning, stacklevel=1)
