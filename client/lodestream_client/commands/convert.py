@@ -16,7 +16,7 @@ from ..terminal.interrupts import interruptible
 from ..terminal.output import note, print_json, working
 from .arguments import Subparsers, add_command, add_json_option, standard_input_once, standard_output_once
 from .encode import read_surface
-from .inputs import named
+from .inputs import input_files, named
 from .outcome import check_out, write_surface
 from .surface_options import SurfaceOptions, add_reading_options, reading_options
 
@@ -85,8 +85,8 @@ def _surface(options: ConvertOptions) -> Surface:
     from lodestream import decode
 
     try:
-        with working("decoding"):
-            surface = decode(Path(first).read_bytes())
+        with input_files([first]) as inputs, working("decoding"):
+            surface = decode(inputs.paths[0].read_bytes())
     except (StreamError, TooLargeError) as error:
         raise named(error, first) from None
     if options.surface.name:
