@@ -318,7 +318,8 @@ def made_url(collection: str, location: str) -> str:
     url = resolved(collection, location)
     server = collection.rpartition("/v1/")[0]
     path = urlsplit(server).path
-    if same_origin(url, server) and not urlsplit(url).path.startswith(f"{path}/"):
+    # The user may have written it as it is read, and the server as it is sent.
+    if same_origin(url, server) and not unquote(urlsplit(url).path).startswith(f"{unquote(path)}/"):
         raise RemoteProtocolError(
             f"{server} gives addresses without its path {path}, such as {url}: where a proxy removes the path from "
             f"requests, the server must be started with LODESTREAM_ROOT_PATH={path}"

@@ -216,6 +216,14 @@ def test_a_server_that_does_not_know_its_path_is_told_of(size: int) -> None:
         assert path == ("/maps/v1/surfaces" if size == 1 else "/maps/v1/uploads")
 
 
+@pytest.mark.parametrize("path", ["/my maps", "/my%20maps", "/höhen", "/h%C3%B6hen", "/h%c3%b6hen", "/~maps"])
+def test_the_path_of_a_server_may_be_written_in_several_ways(path: str) -> None:
+    sent = {"m": "/my%20maps", "h": "/h%C3%B6hen", "~": "/%7Emaps"}[path[1]]
+    location = f"{sent}/v1/surfaces/ab"
+    made = addresses.made_url(addresses.surfaces_url(f"http://host{path}"), location)
+    assert made == f"http://host{location}"
+
+
 @pytest.mark.parametrize(
     ("one", "other", "same"),
     [
