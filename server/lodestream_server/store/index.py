@@ -462,6 +462,10 @@ class Index:
         )
         return bool(self._rows(f"{query} LIMIT 1", surface, now))
 
+    def lacks_names(self) -> bool:
+        """Return whether a name cannot be read: it may lead to any surface, and have replaced any."""
+        return bool(self._rows("SELECT 1 FROM name WHERE surface IS NULL LIMIT 1"))
+
     def names_of(self, surface: str) -> set[str]:
         """Return the keys of the names that lead to a surface, or have replaced it."""
         query = "SELECT key FROM name WHERE surface = ?1 UNION SELECT key FROM replaced WHERE surface = ?1"

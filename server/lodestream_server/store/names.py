@@ -206,15 +206,19 @@ class Names:
         StoreError
             If that could not be stored.
         """
-        if not self._surfaces.is_synced:  # the index may not know yet who has replaced it
+        index = self._surfaces.index
+        # The index may not know yet who has replaced it, and a name that cannot be read may have.
+        if not self._surfaces.is_synced or index.lacks_names():
             self._kept.add(surface)
-        if not self._surfaces.index.replaced_by(surface):  # as of most: nobody need wait for others
+        if not index.replaced_by(surface):  # as of most: nobody need wait for others
             return
         with self._writing:
-            for key in self._surfaces.index.replaced_by(surface):
+            for key in index.replaced_by(surface):
                 if (found := self._current(key)) is not None:
                     name, tag = found
                     self._rewrite(name, tag, tuple(it for it in name.replaced if it[0] != surface))
+                else:
+                    self._kept.add(surface)
 
     def expire(self, now: float | None = None) -> list[Surface]:
         """Delete the replaced surfaces whose time has come; return them.
@@ -249,8 +253,8 @@ class Names:
             return []
         name, tag = found
         index = self._surfaces.index
-        due = (index.find(id_) for id_, when in name.replaced if when <= now and not index.is_kept(id_, now))
-        gone = [surface for surface in due if surface is not None]
+        due = (id_ for id_, when in name.replaced if when <= now and id_ not in self._kept)
+        gone = [surface for id_ in due if not index.is_kept(id_, now) and (surface := index.find(id_)) is not None]
         if gone:
             tag = self._rewrite(name, tag, name.replaced)
         for surface in gone:
@@ -282,10 +286,11 @@ class Names:
             if 0 not in tags or tags[0] != tags.get(1):
                 with self._lock:
                     self._current(key, tags.get(0))
-        kept, self._kept = self._kept, set()
-        for surface in kept:
-            with suppress(StandbyError):  # it is another server's to keep now
-                self.keep(surface)
+        with self._lock:  # nothing expires meanwhile
+            kept, self._kept = self._kept, set()
+            for surface in kept:
+                with suppress(StandbyError):  # it is another server's to keep now
+                    self.keep(surface)
 
     def refresh(self, key: str) -> None:
         """Read a name, by its key, from the store again.

@@ -242,6 +242,37 @@ def test_an_object_that_the_store_does_not_give_stops_nobody(tmp_path: Path, cap
         assert surfaces.get(f"{1:020x}").state == "ready"
 
 
+@pytest.mark.parametrize("start", [False, True], ids=["from now on", "since a start"])
+@pytest.mark.parametrize("alone", [False, True], ids=["with all", "alone"])
+def test_what_came_again_while_a_name_was_not_given_is_kept(tmp_path: Path, start: bool, alone: bool) -> None:
+    """A name that has replaced the surface."""
+    store, key = Withholding(tmp_path / "data"), layout.name_key("name")
+    with closing(Surfaces(store, tmp_path / "before.sqlite")) as surfaces:
+        surfaces.sync()
+        for number in range(2):
+            manifest, files = upload(tmp_path, number)
+            surfaces.accept(manifest, files)
+            build(surfaces, manifest, tmp_path)
+            surfaces.names.point("name", manifest.id, None, lambda _: True, 1.0)
+    index = tmp_path / ("another.sqlite" if start else "before.sqlite")
+    with closing(Surfaces(store, index)) as surfaces:
+        if not start:
+            surfaces.sync()
+        store.withheld = (key,)
+        if start:
+            surfaces.sync()
+        surfaces.accept(*upload(tmp_path, 0))
+        store.withheld = ()
+        if alone:
+            surfaces.refresh([key])
+        else:
+            surfaces.sync()
+        assert surfaces.names.expire(2.0**40) == []
+        assert surfaces.get(f"{0:020x}").state == "ready"
+        surfaces.sync()
+        assert surfaces.names.expire(2.0**40) == []
+
+
 def test_a_store_that_gives_nothing_is_not_taken_for_one_without_surfaces(tmp_path: Path) -> None:
     store = Withholding(tmp_path / "data")
     with closing(Surfaces(store, tmp_path / "before.sqlite")) as surfaces:
