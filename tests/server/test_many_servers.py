@@ -135,6 +135,16 @@ def test_an_upload_that_is_for_another_server_is_no_abuse(
         assert caplog.text.count("connection cut: refused-body") == cuts
 
 
+def test_only_the_writer_says_that_there_is_no_such_upload(site: Site) -> None:
+    """A client that is told so begins again."""
+    servers = {"writer": writer(site), "waiting": site.start("waiting"), "reader": site.start("reader", read_only=True)}
+    headers = {"tus-resumable": "1.0.0", "upload-length": "1000"}
+    begun = servers["writer"].post("/v1/uploads", headers=headers).headers["location"]
+    for path, at_writer in ((begun, 200), (f"/v1/uploads/{'0' * 32}", 404)):
+        statuses = {name: http.head(path, headers=headers).status_code for name, http in servers.items()}
+        assert statuses == {"writer": at_writer, "waiting": 503, "reader": 403}
+
+
 @pytest.fixture
 def gets(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The paths of objects that are read from a bucket, at each request."""

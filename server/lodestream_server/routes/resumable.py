@@ -18,7 +18,7 @@ from fastapi.responses import Response
 from fastapi.routing import APIRoute
 from starlette.requests import ClientDisconnect
 
-from lodestream.errors import InputError, LodestreamError, OptionError, TooLargeError
+from lodestream.errors import InputError, LodestreamError, NotFoundError, OptionError, TooLargeError
 
 from .. import problems
 from ..access.access import Caller
@@ -140,7 +140,7 @@ async def begin_upload(caller: Writer, request: Request, parts: AnyQuery, _: _Tu
                 "Location": "the surface, once the upload is complete",
             },
         ),
-        **responses(404, 412),
+        **responses(404, 412, 503),
     },
 )
 async def show_upload(caller: Writer, request: Request, parts: Parts, upload: str, _: _Tus) -> Response:
@@ -148,7 +148,11 @@ async def show_upload(caller: Writer, request: Request, parts: Parts, upload: st
 
     An upload whose last byte came just before the server ended becomes a surface now.
     """
-    it = parts.partial_uploads.get(upload, caller.owner)
+    try:
+        it = parts.partial_uploads.get(upload, caller.owner)
+    except NotFoundError:
+        parts.surfaces.check_writer()  # whoever is told that there is none begins again
+        raise
     async with it.settled():
         if it.is_complete and it.declared.surface is None:
             async with parts.limits.upload(request, caller):
