@@ -13,7 +13,7 @@ from .answers import Answer
 from .bodies import Body
 from .calls import Call, Flow, Pause
 
-__all__ = ["LEAST", "beginning", "completed", "is_absent"]
+__all__ = ["LEAST", "beginning", "completed", "described", "is_absent"]
 
 #: Bytes from which on an upload is sent in this way: sending less again costs little more than asking does.
 LEAST = 8 << 20
@@ -89,8 +89,39 @@ def completed(uploads: str, address: str, body: Body, begin: Callable[[], Flow[s
             failures += 1
             if failures == _ATTEMPTS or not (problems.passes(error) or isinstance(error, _NoFurtherError)):
                 raise
-            yield Pause(max(wait, random.uniform(0.0, min(_FIRST_PAUSE * 2**failures, _LONGEST_PAUSE))))
+            yield _pause(failures, wait)
             asks = True
+
+
+def described(surface: str, parameters: Mapping[str, str | list[str]] | None = None) -> Flow[Answer]:
+    """Ask for the surface of an upload, which is stored whatever becomes of the question, and return the answer.
+
+    After a lost connection, or an answer that may be another one soon, it is asked for again.
+
+    Raises
+    ------
+    LodestreamError
+        If there is no answer although it was asked for again and again.
+    """
+    for failures in range(1, _ATTEMPTS):
+        try:
+            answer = yield Call("GET", surface, parameters or {})
+            assert answer is not None
+            if 200 <= answer.status < 300 or not problems.passes(_problem(answer, surface)):
+                return answer
+            wait = _asked(answer)
+        except LodestreamError as error:
+            if not problems.passes(error):
+                raise
+            wait = 0.0
+        yield _pause(failures, wait)
+    answer = yield Call("GET", surface, parameters or {})
+    assert answer is not None
+    return answer
+
+
+def _pause(failures: int, asked: float) -> Pause:
+    return Pause(max(asked, random.uniform(0.0, min(_FIRST_PAUSE * 2**failures, _LONGEST_PAUSE))))
 
 
 class _NoFurtherError(RemoteProtocolError):
@@ -114,8 +145,12 @@ def _part(address: str, body: Body, offset: int) -> Call:
 
 def _refuse(answer: Answer, address: str) -> None:
     if not 200 <= answer.status < 300:
-        error = problems.from_response(answer.status, answer.reason, answer.content, address)
+        error = _problem(answer, address)
         raise _NoFurtherError(str(error)) if answer.status in _ELSEWHERE else error
+
+
+def _problem(answer: Answer, address: str) -> LodestreamError:
+    return problems.from_response(answer.status, answer.reason, answer.content, address)
 
 
 def _asked(answer: Answer) -> float:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import hashlib
 import io
 import shutil
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from random import Random
+from typing import TypeVar
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -19,7 +21,7 @@ from hypothesis import strategies as st
 import lodestream as ls
 from lodestream.errors import InputError, LodestreamError, NotFoundError, RemoteProtocolError, TooLargeError
 from lodestream_client import Client
-from lodestream_client.errors import UnreachableError
+from lodestream_client.errors import SilenceError, UnreachableError
 from lodestream_client.requests import problems, resuming
 from lodestream_client.requests.answers import Answer
 from lodestream_client.requests.bodies import Body
@@ -27,6 +29,8 @@ from lodestream_client.requests.calls import Call, Flow, Pause
 from lodestream_server import running_server
 from tests.links import Fault, linked
 from tests.server.programs import Server
+
+T = TypeVar("T")
 
 UPLOADS = "http://host/v1/uploads"
 ADDRESS = f"{UPLOADS}/0"
@@ -61,23 +65,28 @@ class Other:
 
     def run(self, sent: Body, respond: Callable[[Call], Answer]) -> str:
         """Carry out an upload; `respond` answers, or raises what the client sees."""
-        flow = resuming.completed(UPLOADS, ADDRESS, sent, _begun)
-        step = next(flow)
-        try:
-            while True:
-                if isinstance(step, Pause):
-                    self.paused.append(step.seconds)
-                    step = flow.send(None)
-                    continue
-                assert isinstance(step, Call)
-                try:
-                    answer = respond(step)
-                except LodestreamError as error:
-                    step = flow.throw(error)
-                else:
-                    step = flow.send(answer)
-        except StopIteration as end:
-            return str(end.value)
+        return carried_out(resuming.completed(UPLOADS, ADDRESS, sent, _begun), respond, self.paused)
+
+
+def carried_out(flow: Flow[T], respond: Callable[[Call], Answer], paused: list[float]) -> T:
+    """Carry out requests; `respond` answers, or raises what the client sees."""
+    step = next(flow)
+    try:
+        while True:
+            if isinstance(step, Pause):
+                paused.append(step.seconds)
+                step = flow.send(None)
+                continue
+            assert isinstance(step, Call)
+            try:
+                answer = respond(step)
+            except LodestreamError as error:
+                step = flow.throw(error)
+            else:
+                step = flow.send(answer)
+    except StopIteration as end:
+        result: T = end.value
+        return result
 
 
 def _begun() -> Flow[str | None]:
@@ -169,6 +178,69 @@ def test_an_upload_that_is_lost_again_and_again_is_given_up() -> None:
     with pytest.raises(NotFoundError, match="No upload 0"):
         server.run(body(), respond)
     assert asked.count("POST") == 3
+
+
+READY = Answer(200, "OK", {}, b'{"state": "ready"}')
+REFUSED = Answer(403, "Forbidden", {}, b'{"code": "forbidden", "detail": "no"}')
+
+
+@pytest.mark.parametrize("last", [READY, REFUSED])
+def test_a_surface_that_is_stored_is_asked_for_until_there_is_an_answer(last: Answer) -> None:
+    lost = UnreachableError("no connection")
+    coming = iter((lost, Answer(503, "", {"retry-after": "7"}), SilenceError("nothing"), Answer(502, "", {}), last))
+    asked, paused = list[Call](), list[float]()
+
+    def respond(call: Call) -> Answer:
+        asked.append(call)
+        answer = next(coming)
+        if isinstance(answer, LodestreamError):
+            raise answer
+        return answer
+
+    surface = "http://host/v1/surfaces/1"
+    assert carried_out(resuming.described(surface, {"wait": "20"}), respond, paused) is last
+    assert asked == [Call("GET", surface, {"wait": "20"})] * 5
+    assert (len(paused), paused[1]) == (4, 7)
+
+
+def test_what_does_not_answer_is_given_up() -> None:
+    asked, paused = list[Call](), list[float]()
+
+    def silent(call: Call) -> Answer:
+        asked.append(call)
+        raise UnreachableError("no connection to host")
+
+    with pytest.raises(UnreachableError, match="no connection to host"):
+        carried_out(resuming.described("http://host/v1/surfaces/1"), silent, paused)
+    assert (len(asked), len(paused)) == (12, 11)
+    busy = Answer(503, "", {})
+    assert carried_out(resuming.described("http://host/v1/surfaces/1"), partial(_always, busy), paused) is busy
+
+
+def test_a_link_that_breaks_while_a_surface_is_built_does_not_matter(
+    server: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(resuming, "_FIRST_PAUSE", 0.001)
+    breaks = [3]
+
+    def fault(number: int) -> Fault:
+        if began and breaks[0]:
+            breaks[0] -= 1
+            return Fault(cut_down=50, reset=True)
+        return Fault()
+
+    began = list[float]()
+
+    def progress(stage: str, fraction: float) -> None:
+        if stage == "building" and not began:
+            began.append(fraction)
+            link.cut()
+            while link.open:
+                time.sleep(0.001)
+
+    with linked(server, fault) as link, Client(link.url) as client:
+        assert client.upload(ls.Surface(np.random.default_rng(11).normal(size=(300, 300))), progress=progress).ready
+    assert breaks == [0]
 
 
 def _always(answer: Answer, call: Call) -> Answer:
