@@ -204,7 +204,7 @@ def _in_parts(url: str, named: Mapping[str, str | list[str]], body: Body) -> Flo
     if address is None:
         return None
     surface = yield from resuming.completed(uploads, address, body, begin)
-    return _described(_checked((yield from resuming.described(surface)), surface), surface)
+    return _described(_checked((yield from resuming.answered(surface)), surface), surface)
 
 
 def _begun(uploads: str, named: Mapping[str, str | list[str]], body: Body) -> Flow[str | None]:
@@ -245,7 +245,7 @@ def _followed(surface: Description, wait: bool, progress: Progress | None) -> Fl
             raise RemoteError(surface.state, reason)
         if progress is not None:
             progress("building", _fraction(surface.details))
-        answer = yield from resuming.described(surface.url, seconds)
+        answer = yield from resuming.answered(surface.url, seconds)
         surface = _described(_checked(answer, surface.url), surface.url)
     return surface
 

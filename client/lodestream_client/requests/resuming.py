@@ -13,7 +13,7 @@ from .answers import Answer
 from .bodies import Body
 from .calls import Call, Flow, Pause
 
-__all__ = ["LEAST", "beginning", "completed", "described", "is_absent"]
+__all__ = ["LEAST", "answered", "beginning", "completed", "is_absent"]
 
 #: Bytes from which on an upload is sent in this way: sending less again costs little more than asking does.
 LEAST = 8 << 20
@@ -93,7 +93,7 @@ def completed(uploads: str, address: str, body: Body, begin: Callable[[], Flow[s
             asks = True
 
 
-def described(surface: str, parameters: Mapping[str, str | list[str]] | None = None) -> Flow[Answer]:
+def answered(surface: str, parameters: Mapping[str, str | list[str]] | None = None) -> Flow[Answer]:
     """Ask for the surface of an upload, which is stored whatever becomes of the question, and return the answer.
 
     After a lost connection, or an answer that may be another one soon, it is asked for again.

@@ -198,7 +198,7 @@ def test_a_surface_that_is_stored_is_asked_for_until_there_is_an_answer(last: An
         return answer
 
     surface = "http://host/v1/surfaces/1"
-    assert carried_out(resuming.described(surface, {"wait": "20"}), respond, paused) is last
+    assert carried_out(resuming.answered(surface, {"wait": "20"}), respond, paused) is last
     assert asked == [Call("GET", surface, {"wait": "20"})] * 5
     assert (len(paused), paused[1]) == (4, 7)
 
@@ -211,10 +211,10 @@ def test_what_does_not_answer_is_given_up() -> None:
         raise UnreachableError("no connection to host")
 
     with pytest.raises(UnreachableError, match="no connection to host"):
-        carried_out(resuming.described("http://host/v1/surfaces/1"), silent, paused)
+        carried_out(resuming.answered("http://host/v1/surfaces/1"), silent, paused)
     assert (len(asked), len(paused)) == (12, 11)
     busy = Answer(503, "", {})
-    assert carried_out(resuming.described("http://host/v1/surfaces/1"), partial(_always, busy), paused) is busy
+    assert carried_out(resuming.answered("http://host/v1/surfaces/1"), partial(_always, busy), paused) is busy
 
 
 def test_a_link_that_breaks_while_a_surface_is_built_does_not_matter(
